@@ -30,7 +30,7 @@ class CameraModel:
     world_T_camera: NDArray[np.float64]
     """Pose (4, 4): takes points of the camera frame to the world frame, metres."""
     near: float
-    """Least depth of the working range, metres. Depth is clipped to it, quantised over it and scaled to [0, 1] by it."""
+    """Least depth of the working range, metres: depth is clipped to the range, quantised over it, scaled to [0, 1] by it."""
     far: float
     """Greatest depth of the working range, metres."""
 
