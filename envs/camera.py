@@ -30,7 +30,7 @@ class CameraModel:
     world_T_camera: NDArray[np.float64]
     """Pose (4, 4): takes points of the camera frame to the world frame, metres."""
     near: float
-    """Least depth of the working range, metres: depth is clipped to the range, quantised over it, scaled to [0, 1] by it."""
+    """Least depth of the working range, metres. Depth is clipped to it, quantised over it, scaled by it to [0, 1]."""
     far: float
     """Greatest depth of the working range, metres."""
 
@@ -46,12 +46,8 @@ class CameraModel:
         object.__setattr__(self, "near", near)
         object.__setattr__(self, "far", far)
         K = _frozen_matrix("K", self.K, (3, 3))
-        if (
-            K[0, 0] <= 0
-            or K[1, 1] <= 0
-            or K[0, 1] != 0
-            or not np.array_equal(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1])
-        ):
+        fixed_entries = K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]]
+        if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.array_equal(fixed_entries, [0, 0, 0, 0, 1]):
             raise UsageError(f"K is {K.tolist()}; give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy")
         pose = _frozen_matrix("world_T_camera", self.world_T_camera, (4, 4))
         rotation = pose[:3, :3]

@@ -1,0 +1,254 @@
+"""The static RGB-D camera: one pass of MuJoCo's renderer gives anti-aliased colour and exact metric depth."""
+
+from __future__ import annotations
+
+import os
+import weakref
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any
+
+import cv2
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.camera import CameraModel
+from envs.errors import UsageError
+from envs.gl import EGLContext, OSMesaContext, create_context
+
+VISIBLE_GROUPS = (1, 2)
+"""Geom groups that are drawn. Group 0 holds collision shapes (robosuite's habit), 3 and up hold aids and targets."""
+
+
+class StaticCamera:
+    """A camera that stands still in a MuJoCo model and sees colour, depth and body ids.
+
+    The OpenGL context is made at the first picture, in the process that asks for it, and lives until `close`.
+    Sites, tendons, lights and other decoration are never drawn, nor are shadows, reflections, fog and haze.
+
+    Args:
+        model: the compiled model.
+        name: an MJCF `<camera>` that is fixed in the world.
+        width: pixels in a row.
+        height: rows.
+        near: least depth that is told apart, metres; nearer is clipped to it.
+        far: greatest depth that is told apart, metres; farther, and where nothing is, is clipped to it.
+        supersample: the scene is drawn this many times wider and higher. Colour is averaged over each block, depth and
+            ids are its centre sample: hence an odd number.
+        visible_groups: geom groups that are drawn.
+
+    Raises:
+        UsageError: no such camera, or it moves, or the numbers do not fit together.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        name: str,
+        width: int,
+        height: int,
+        near: float,
+        far: float,
+        supersample: int = 3,
+        visible_groups: Sequence[int] = VISIBLE_GROUPS,
+    ) -> None:
+        if supersample < 1 or supersample % 2 == 0:
+            raise UsageError(f"supersample is {supersample!r}; give an odd number, so that a block has a centre sample")
+        if not visible_groups or not set(visible_groups) <= set(range(mujoco.mjNGROUP)):
+            raise UsageError(f"visible_groups is {visible_groups!r}; give numbers from 0 to {mujoco.mjNGROUP - 1}")
+        self._model = model
+        self._id = _fixed_camera_id(model, name)
+        self.geometry = _camera_model(model, self._id, width, height, near, far)
+        _check_clipping(model, self.geometry)
+        self.supersample = supersample
+
+        large = (height * supersample, width * supersample)
+        self._viewport = mujoco.MjrRect(0, 0, large[1], large[0])
+        self._rgb = np.empty((*large, 3), np.uint8)
+        self._zbuffer = np.empty(large, np.float32)
+        self._option = mujoco.MjvOption()
+        for kind in ("geomgroup", "sitegroup", "jointgroup", "tendongroup", "actuatorgroup", "flexgroup", "skingroup"):
+            getattr(self._option, kind)[:] = 0
+        for group in visible_groups:
+            self._option.geomgroup[group] = self._option.flexgroup[group] = self._option.skingroup[group] = 1
+        self._view = mujoco.MjvCamera()
+        self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._view.fixedcamid = self._id
+        self._scene: mujoco.MjvScene | None = None
+        self._gl: EGLContext | OSMesaContext | None = None
+        self._mjr: Any = None
+        self._release: weakref.finalize | None = None
+
+    def render(self, data: mujoco.MjData) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Colour and depth, from one and the same pass.
+
+        Args:
+            data: the state to show; its kinematics must be up to date (after `mj_step`, `mj_forward`, ...).
+
+        Returns:
+            rgb: (height, width, 3) uint8, anti-aliased.
+            depth: (height, width) float32, planar, metres, at the pixel centres, clipped to [near, far].
+
+        Raises:
+            UsageError: no OpenGL works.
+        """
+        scene = self._draw(data)
+        mujoco.mjr_readPixels(self._rgb, self._zbuffer, self._viewport, self._mjr)
+        height, width = self.geometry.height, self.geometry.width
+        rgb = self._rgb
+        if self.supersample > 1:
+            rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+        frustum = scene.camera[0]
+        depth = metric_depth(self._centre_samples(self._zbuffer), frustum.frustum_near, frustum.frustum_far)
+        depth = np.clip(depth, self.geometry.near, self.geometry.far).astype(np.float32)
+        return np.ascontiguousarray(rgb[::-1]), np.ascontiguousarray(depth[::-1])
+
+    def segment(self, data: mujoco.MjData) -> NDArray[np.int32]:
+        """The body under each pixel centre, at the very samples that `render` takes depth from.
+
+        Args:
+            data: the state to show; its kinematics must be up to date.
+
+        Returns:
+            (height, width) int32 body ids; 0 is the world, and where nothing is.
+
+        Raises:
+            UsageError: no OpenGL works.
+        """
+        scene = self._draw(data, ids=True)
+        mujoco.mjr_readPixels(self._rgb, None, self._viewport, self._mjr)
+        samples = self._centre_samples(self._rgb).astype(np.int32)[::-1]
+        segment_id = samples[..., 0] | samples[..., 1] << 8 | samples[..., 2] << 16  # 0: nothing drawn
+        body_of = np.zeros(scene.ngeom + 1, np.int32)
+        for geom in scene.geoms[: scene.ngeom]:
+            if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+                body_of[geom.segid + 1] = self._model.geom_bodyid[geom.objid]
+        return body_of[segment_id]
+
+    def gl_renderer(self) -> str:
+        """What draws, e.g. `egl: llvmpipe (LLVM 15.0.6, 256 bits)`.
+
+        Raises:
+            UsageError: no OpenGL works.
+        """
+        gl = self._ensure_context()[0]
+        return f"{gl.backend}: {gl.gl_renderer()}"
+
+    def close(self) -> None:
+        """Give the OpenGL context back. The camera may still be used: the next picture makes a new one."""
+        if self._release is not None:
+            self._release()
+        self._gl = self._mjr = self._scene = self._release = None
+
+    def __enter__(self) -> StaticCamera:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _ensure_context(self) -> tuple[EGLContext | OSMesaContext, mujoco.MjvScene]:
+        if self._gl is None or self._scene is None:
+            self._gl = create_context()
+            self._gl.make_current()
+            self._mjr = _offscreen_renderer(self._model, self._viewport)
+            self._release = weakref.finalize(self, _free, self._gl, self._mjr, os.getpid())
+            self._scene = mujoco.MjvScene(self._model, maxgeom=self._model.ngeom + self._model.nskin + 64)
+            unwanted = mujoco.mjtRndFlag
+            for flag in (unwanted.mjRND_SHADOW, unwanted.mjRND_REFLECTION, unwanted.mjRND_FOG, unwanted.mjRND_HAZE):
+                self._scene.flags[flag] = False
+        return self._gl, self._scene
+
+    def _draw(self, data: mujoco.MjData, ids: bool = False) -> mujoco.MjvScene:
+        gl, scene = self._ensure_context()
+        gl.make_current()
+        physical = mujoco.mjtCatBit.mjCAT_STATIC | mujoco.mjtCatBit.mjCAT_DYNAMIC
+        mujoco.mjv_updateScene(self._model, data, self._option, None, self._view, physical, scene)
+        scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = ids
+        scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = ids
+        mujoco.mjr_render(self._viewport, scene, self._mjr)
+        return scene
+
+    def _centre_samples(self, image: NDArray[Any]) -> NDArray[Any]:
+        middle = self.supersample // 2
+        return image[middle :: self.supersample, middle :: self.supersample]
+
+
+def metric_depth(zbuffer: NDArray[np.float32], near: float, far: float) -> NDArray[np.float64]:
+    """Planar depth from MuJoCo's reversed z-buffer (1 at the near plane, 0 at the far plane).
+
+    Args:
+        zbuffer: any shape, as `mjr_readPixels` gives it with `mjDEPTH_ZEROFAR`.
+        near: the near plane of the frustum, metres.
+        far: the far plane of the frustum, metres.
+
+    Returns:
+        Depth of the same shape, float64, metres.
+    """
+    span = far - near
+    return (far * near / span) / (zbuffer.astype(np.float64) + 0.5 * (far + near) / span - 0.5)
+
+
+def _fixed_camera_id(model: mujoco.MjModel, name: str) -> int:
+    camera_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name)
+    if camera_id < 0:
+        known = [model.camera(i).name for i in range(model.ncam)]
+        raise UsageError(f"the model has no camera {name!r}; it has {known}")
+    body = model.cam_bodyid[camera_id]
+    fixed = model.cam_mode[camera_id] == mujoco.mjtCamLight.mjCAMLIGHT_FIXED
+    if not fixed or model.body_weldid[body] != 0 or model.body_mocapid[body] >= 0:
+        raise UsageError(f"camera {name!r} moves; give it mode='fixed' and a body that is fixed in the world")
+    if model.cam_sensorsize[camera_id].any():
+        raise UsageError(f"camera {name!r} has a sensorsize; state its fovy instead")
+    return camera_id
+
+
+def _camera_model(
+    model: mujoco.MjModel, camera_id: int, width: int, height: int, near: float, far: float
+) -> CameraModel:
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_camlight(model, data)
+    pose = np.eye(4)
+    pose[:3, :3] = data.cam_xmat[camera_id].reshape(3, 3) * [1, -1, -1]  # OpenGL looks along -z, with +y up
+    pose[:3, 3] = data.cam_xpos[camera_id]
+    return CameraModel.from_fovy(width, height, float(model.cam_fovy[camera_id]), pose, near, far)
+
+
+def _check_clipping(model: mujoco.MjModel, camera: CameraModel) -> None:
+    near, far = (plane * model.stat.extent for plane in (model.vis.map.znear, model.vis.map.zfar))
+    if near > camera.near or far < camera.far:
+        raise UsageError(
+            f"the model is clipped to {near:.3g} .. {far:.3g} m, which does not hold the camera's working range"
+            f" {camera.near:g} .. {camera.far:g} m; set <visual><map znear zfar/> (they are times <statistic extent/>)"
+        )
+
+
+def _offscreen_renderer(model: mujoco.MjModel, viewport: mujoco.MjrRect) -> Any:
+    """MuJoCo's renderer, with a framebuffer of this size, on the current OpenGL context; the model stays as it was."""
+    settings = (
+        (model.vis.global_, "offwidth", viewport.width),
+        (model.vis.global_, "offheight", viewport.height),
+        (model.vis.quality, "offsamples", 0),  # multisampling costs 3x and blends depth across edges
+        (model.vis.quality, "shadowsize", 0),
+    )
+    before = [getattr(owner, name) for owner, name, _ in settings]
+    try:
+        for owner, name, value in settings:
+            setattr(owner, name, value)
+        renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
+    finally:
+        for (owner, name, _), value in zip(settings, before, strict=True):
+            setattr(owner, name, value)
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, renderer)
+    renderer.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+    return renderer
+
+
+def _free(gl: EGLContext | OSMesaContext, renderer: Any, process: int) -> None:
+    if os.getpid() == process:  # a forked child must not touch its parent's context
+        gl.make_current()
+        renderer.free()
+        gl.free()
