@@ -1,0 +1,115 @@
+"""`collect-rollouts`: have a policy act in an environment and write what happens as a dataset."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Literal
+
+from tqdm import tqdm
+
+from data_collection.environments import resolve_env
+from data_collection.files import locked, remove_leftovers
+from data_collection.manifest import MANIFEST_NAME, Manifest, read_manifest
+from data_collection.schema import SHARD_PATTERN, read_shard
+from data_collection.workers import Collected, collect_episodes
+from data_collection.writer import shard_path
+from envs.command import run
+from envs.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Config:
+    """Collect RGB-D episodes into a dataset folder. The same command on the same folder goes on where it stopped."""
+
+    out: Path
+    """Folder of the dataset; made if it is not there."""
+    env: str = "tabletop"
+    """Environment: a short name (tabletop), or any Gymnasium id whose environment has a `camera`."""
+    scene: str = "C"
+    """Scene, where the environment has several (tabletop: A, B, C, D)."""
+    episodes: int = 400
+    """Episodes the dataset shall have; a larger number extends it."""
+    steps: int = 240
+    """Actions in an episode, which has one frame more."""
+    policy: Literal["play", "noise", "random"] = "play"
+    """Who acts: scripted play, smooth coloured noise, or uniform noise."""
+    seed: int = 0
+    """With the number of an episode it fixes that episode, whatever the number of workers."""
+    workers: int = 2
+    """Processes that collect."""
+    image_size: int = 64
+    """Height and width of the images, pixels."""
+    ground_truth: bool = False
+    """Also record what a model never sees: body ids of the pixels and poses of the bodies (for scene flow)."""
+    episode_timeout: float = 300.0
+    """Seconds after which a worker that has not finished its episode counts as hung and is replaced."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("episodes", 1), ("steps", 1), ("workers", 1), ("seed", 0), ("image_size", 8)):
+            if getattr(self, name) < least:
+                option = name.replace("_", "-")
+                raise UsageError(f"--{option} is {getattr(self, name)}; give a whole number of at least {least}")
+        if not self.episode_timeout > 0:
+            raise UsageError(f"--episode-timeout is {self.episode_timeout}; give a positive number of seconds")
+        if self.out.exists() and not self.out.is_dir():
+            raise UsageError(f"--out {self.out} is a file; give a folder")
+
+    def manifest(self) -> Manifest:
+        env_id, env_kwargs = resolve_env(self.env, self.scene)
+        return Manifest(
+            env_id=env_id,
+            env_kwargs={**env_kwargs, "image_size": self.image_size},
+            policy=self.policy,
+            seed=self.seed,
+            steps=self.steps,
+            ground_truth=self.ground_truth,
+            episodes=self.episodes,
+        )
+
+
+def main(config: Config) -> None:
+    """Collect the episodes that the dataset does not have yet."""
+    manifest, folder = config.manifest(), config.out
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder):
+        _begin(manifest, folder)
+        missing = [number for number in range(config.episodes) if not shard_path(folder, number).exists()]
+        done = config.episodes - len(missing)
+        with tqdm(total=config.episodes, initial=done, unit="episode", desc=folder.name, file=sys.stderr) as progress:
+            for event in collect_episodes(manifest, folder, missing, config.workers, config.episode_timeout):
+                if isinstance(event, Collected):
+                    progress.update()
+                else:
+                    lost = f"{event.worker} lost episode {event.episode}: {event.reason}"
+                    progress.write(f"{lost}; replaced, the episode starts again", file=sys.stderr)
+    print(f"{config.episodes} episodes in {folder}; look at them with: inspect-dataset {folder}")
+
+
+def _begin(manifest: Manifest, folder: Path) -> None:
+    """Check that the folder is new or of the same run, and that what it has is whole."""
+    remove_leftovers(folder)
+    before = read_manifest(folder)
+    shards = sorted(folder.glob(SHARD_PATTERN))
+    if before is None:
+        if shards:
+            raise UsageError(f"{folder} has shards but no {MANIFEST_NAME}; choose another --out")
+    else:
+        manifest.check_continues(before, folder)
+    for shard in shards:
+        read_shard(shard)
+    if before is None or before.episodes < manifest.episodes:
+        manifest.save(folder)
+
+
+def _stop(signum: int, frame: FrameType | None) -> None:
+    print("terminated; run the same command again to go on", file=sys.stderr)
+    sys.exit(128 + signum)
+
+
+def command() -> None:
+    signal.signal(signal.SIGTERM, _stop)
+    run(Config, main)

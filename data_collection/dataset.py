@@ -1,0 +1,180 @@
+"""Reading a dataset: a folder of shards as one set of flat columns."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from data_collection.schema import (
+    COLUMNS,
+    GROUND_TRUTH,
+    MEANING,
+    SHARD_PATTERN,
+    DamagedShard,
+    Shard,
+    dequantise_depth,
+    read_shard,
+)
+from envs.camera import CameraModel
+from envs.errors import UsageError
+
+
+class RGBDDataset:
+    """A folder of shards, checked when opened and read on demand.
+
+    No file stays open between calls, so an instance can be pickled to a spawned process and used after a fork.
+
+    Args:
+        path: the dataset's folder.
+        columns: the columns that will be read; None means all that the schema requires, and reading whatever is there.
+
+    Raises:
+        UsageError: the folder or a column is missing, a shard is damaged, or the shards do not belong together.
+    """
+
+    def __init__(self, path: str | Path, columns: Sequence[str] | None = None) -> None:
+        self.path = Path(path)
+        if not self.path.is_dir():
+            raise UsageError(f"no dataset folder {self.path}; make one with: collect-rollouts --out {self.path}")
+        paths = sorted(self.path.glob(SHARD_PATTERN))
+        if not paths:
+            raise UsageError(f"no {SHARD_PATTERN} in {self.path}; collect with: collect-rollouts --out {self.path}")
+        self._shards = [read_shard(shard) for shard in paths]
+        required = [name for name, column in COLUMNS.items() if column.required] if columns is None else list(columns)
+        for shard in self._shards:
+            self._check(shard, required)
+        present = set.intersection(*(set(shard.columns) for shard in self._shards))
+        self.columns: tuple[str, ...] = tuple(n for n in COLUMNS if n in present and (columns is None or n in columns))
+        self.attrs: dict[str, Any] = self._shards[0].attrs
+        self.camera: CameraModel = CameraModel.from_json(json.dumps(self.attrs["camera"]))
+        self.has_ground_truth: bool = set(GROUND_TRUTH) <= present
+        self.episode_lengths: NDArray[np.int64] = np.concatenate([shard.ep_len for shard in self._shards])
+
+    def _check(self, shard: Shard, required: Sequence[str]) -> None:
+        first = self._shards[0]
+        for name in required:
+            if name not in shard.columns:
+                raise UsageError(
+                    f"{shard.path} has no column '{name}' (it has {', '.join(shard.columns)}); "
+                    f"use a dataset that has it, as collect-rollouts writes"
+                    + (" with --ground-truth" if name in GROUND_TRUTH else "")
+                )
+            if shard.columns[name] != first.columns[name]:
+                raise UsageError(
+                    f"column '{name}' has rows of {shard.columns[name]} in {shard.path} but {first.columns[name]} in "
+                    f"{first.path.name}; keep one dataset in a folder"
+                )
+        for name in MEANING:
+            if shard.attrs[name] != first.attrs[name]:
+                raise UsageError(
+                    f"{shard.path} has {name} = {shard.attrs[name]!r} but {first.path.name} has "
+                    f"{first.attrs[name]!r}; keep one dataset in a folder"
+                )
+
+    def __len__(self) -> int:
+        return len(self.episode_lengths)
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return len(self.episode_lengths)
+
+    @property
+    def files(self) -> list[Path]:
+        """The shards, in order."""
+        return [shard.path for shard in self._shards]
+
+    @property
+    def action_dim(self) -> int:
+        """Numbers in an action."""
+        return self._shards[0].columns["action"][0]
+
+    @property
+    def episode_slices(self) -> NDArray[np.int64]:
+        """(E, 2) first row and row past the last of each episode in the columns that `load` gives."""
+        stops = np.cumsum(self.episode_lengths)
+        return np.stack([stops - self.episode_lengths, stops], axis=1)
+
+    @property
+    def episode_indices(self) -> NDArray[np.int64]:
+        """(E,) number of each episode in the run that collected it; gaps where episodes were dropped."""
+        return np.concatenate([shard.ep_index for shard in self._shards])
+
+    def load(self, column: str) -> NDArray[Any]:
+        """A whole column of all shards, (N, ...), in its stored dtype.
+
+        Raises:
+            UsageError: no such column, or a shard is damaged.
+        """
+        self._require(column)
+        rows = int(self.episode_lengths.sum())
+        values = np.empty((rows, *self._shards[0].columns[column]), COLUMNS[column].dtype)
+        start = 0
+        for shard in self._shards:
+            stop = start + shard.rows
+            with _reading(shard) as file:
+                file[column].read_direct(values, dest_sel=np.s_[start:stop])
+            start = stop
+        return values
+
+    def episode(self, number: int) -> dict[str, NDArray[Any]]:
+        """All columns of one episode, (rows, ...) each, in their stored dtypes.
+
+        Args:
+            number: 0 .. episodes - 1.
+        """
+        if not 0 <= number < self.episodes:
+            raise IndexError(f"episode {number} of a dataset of {self.episodes}")
+        for shard in self._shards:
+            if number < len(shard.ep_len):
+                start = int(shard.ep_offset[number])
+                stop = start + int(shard.ep_len[number])
+                with _reading(shard) as file:
+                    return {name: file[name][start:stop] for name in self.columns}
+            number -= len(shard.ep_len)
+        raise AssertionError("unreachable: lengths and shards agree")
+
+    def depth_metres(self, raw: NDArray[np.uint16]) -> NDArray[np.float32]:
+        """Stored depth of any shape -> metres, float32."""
+        return dequantise_depth(raw, self.camera.near, self.camera.far)
+
+    @property
+    def content_hash(self) -> str:
+        """SHA-256 (hex) of what the data is: the episodes in order and the attributes that give them meaning.
+
+        Does not depend on how the episodes are spread over shards, on compression, or on who collected them when.
+        """
+        digest = hashlib.sha256(json.dumps({name: self.attrs[name] for name in MEANING}, sort_keys=True).encode())
+        for shard in self._shards:
+            digest.update(np.ascontiguousarray(shard.ep_hash).data)
+        return digest.hexdigest()
+
+    def _require(self, column: str) -> None:
+        if column not in self.columns:
+            raise UsageError(f"no column '{column}' in {self.path}; it has {', '.join(self.columns)}")
+
+
+class _reading:
+    """A shard open for reading; what HDF5 cannot read is a damaged shard."""
+
+    def __init__(self, shard: Shard) -> None:
+        self._shard = shard
+
+    def __enter__(self) -> h5py.File:
+        try:
+            self._file = h5py.File(self._shard.path, "r")
+        except OSError as error:
+            raise DamagedShard(self._shard.path, str(error)) from error
+        return self._file
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        self._file.close()
+        if isinstance(error, OSError | RuntimeError):
+            raise DamagedShard(self._shard.path, str(error)) from error

@@ -1,0 +1,101 @@
+"""Which environments the collector knows, and what a dataset says about the one that made it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+import envs  # noqa: F401  (registers the environments)
+from envs.errors import UsageError
+
+PACKAGES = ("t3vip", "mujoco", "robosuite", "gymnasium", "numpy", "h5py")
+NEEDED = ("camera", "get_state", "ACTION_AGGREGATION", "ACTION_SCALE", "control_rate")
+NEEDED_FOR_GROUND_TRUTH = ("segmentation", "body_poses", "body_names", "hand_body_ids")
+
+
+@dataclass(frozen=True)
+class KnownEnv:
+    """An environment by its short name."""
+
+    env_id: str
+    """Gymnasium id; `{scene}` stands for the scene's letter."""
+    scenes: tuple[str, ...] = ()
+    kwargs: dict[str, Any] = field(default_factory=dict)
+
+
+KNOWN_ENVS: dict[str, KnownEnv] = {
+    "tabletop": KnownEnv("t3vip/Tabletop{scene}-v0", scenes=("A", "B", "C", "D")),
+}
+
+
+def resolve_env(name: str, scene: str | None) -> tuple[str, dict[str, Any]]:
+    """Short name, or any Gymnasium id ("package/Name-v0", "module:Name-v0") -> (Gymnasium id, keyword arguments).
+
+    Raises:
+        UsageError: unknown name or scene.
+    """
+    if name not in KNOWN_ENVS:
+        if "/" in name or ":" in name:
+            return name, {}
+        known_names = ", ".join(KNOWN_ENVS)
+        raise UsageError(f"no environment named '{name}'; choose one of {known_names}, or give a Gymnasium id")
+    known = KNOWN_ENVS[name]
+    if known.scenes and scene not in known.scenes:
+        raise UsageError(f"{name} has no scene '{scene}'; choose one of {', '.join(known.scenes)}")
+    return known.env_id.format(scene=scene), dict(known.kwargs)
+
+
+def make_env(env_id: str, env_kwargs: dict[str, Any], ground_truth: bool) -> gymnasium.Env:
+    """Make an environment to collect from: no time limit, checked for what a dataset needs.
+
+    Raises:
+        UsageError: it cannot be made, or lacks something.
+    """
+    try:
+        env = gymnasium.make(env_id, max_episode_steps=-1, disable_env_checker=True, **env_kwargs)
+    except (gymnasium.error.Error, ModuleNotFoundError, TypeError) as error:
+        raise UsageError(f"cannot make environment '{env_id}' with {env_kwargs}: {error}; check --env") from error
+    for name in NEEDED + (NEEDED_FOR_GROUND_TRUTH if ground_truth else ()):
+        if not hasattr(env.unwrapped, name):
+            raise UsageError(f"environment '{env_id}' has no attribute '{name}'; it cannot be collected from")
+    for key in ("rgb", "depth", "proprio"):
+        if key not in getattr(env.observation_space, "spaces", {}):
+            raise UsageError(f"environment '{env_id}' does not observe '{key}'; it cannot be collected from")
+    return env
+
+
+def describe_env(env: gymnasium.Env, env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
+    """The attributes of a shard that follow from the environment; call after the first `reset`."""
+    inner: Any = env.unwrapped
+    camera = inner.camera
+    attrs = {
+        "env_id": env_id,
+        "env_kwargs": env_kwargs,
+        "control_rate": float(inner.control_rate),
+        "K": camera.K,
+        "world_T_camera": camera.world_T_camera,
+        "near": camera.near,
+        "far": camera.far,
+        "camera": json.loads(camera.to_json()),
+        "action_aggregation": list(inner.ACTION_AGGREGATION),
+        "action_scale": [float(unit) for unit in inner.ACTION_SCALE],
+        "body_names": list(getattr(inner, "body_names", [])),
+        "hand_body_ids": [int(body) for body in getattr(inner, "hand_body_ids", ())],
+        "versions": {package: _version(package) for package in PACKAGES},
+        "gl_renderer": str(getattr(inner, "gl_renderer", "unknown")),
+    }
+    if hasattr(inner, "workspace"):
+        attrs["workspace"] = [np.asarray(corner, float).tolist() for corner in inner.workspace]
+    return attrs
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None

@@ -1,0 +1,80 @@
+"""Files that are whole or not there: written aside, synced, renamed. And a lock that a killed process releases."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from envs.errors import UsageError
+
+LOCK_NAME = ".lock"
+
+
+@contextlib.contextmanager
+def written_aside(path: Path) -> Iterator[Path]:
+    """Give the path of a temporary file that takes the place of `path` when the block ends well.
+
+    The temporary name carries the process id, so that two processes never write into the same file. An exception in
+    the block removes it; a killed process leaves a `*.tmp` that `remove_leftovers` clears.
+    """
+    aside = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    try:
+        yield aside
+        _sync(aside)
+        os.replace(aside, path)
+    except BaseException:
+        aside.unlink(missing_ok=True)
+        raise
+    _sync(path.parent)
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write `content` as JSON, atomically."""
+    with written_aside(path) as aside:
+        aside.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def remove_leftovers(folder: Path) -> list[str]:
+    """Remove the temporary files of killed writers; hold the folder's lock before calling.
+
+    Returns:
+        the names of what was removed.
+    """
+    leftovers = sorted(folder.glob("*.tmp"))
+    for leftover in leftovers:
+        leftover.unlink(missing_ok=True)
+    return [leftover.name for leftover in leftovers]
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Be the only process that writes datasets in `folder`; the kernel frees the lock when the process dies.
+
+    Raises:
+        UsageError: another process holds it.
+    """
+    handle = os.open(folder / LOCK_NAME, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o644)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise UsageError(
+                f"another process is writing to {folder}; wait for it to end, or choose another folder"
+            ) from error
+        yield
+    finally:
+        os.close(handle)
+
+
+def _sync(path: Path) -> None:
+    """Have the kernel put a file or a folder's entries on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,35 @@
+"""Policies that act in environments to make data, by name."""
+
+from __future__ import annotations
+
+from data_collection.policies.base import Policy
+from envs.errors import UsageError
+
+POLICIES = ("play", "noise", "random")
+
+
+def make_policy(name: str) -> Policy:
+    """A new policy.
+
+    Args:
+        name: "play" (scripted play, looks into the simulator), "noise" (coloured noise) or "random" (uniform).
+
+    Raises:
+        UsageError: no such policy.
+    """
+    if name == "play":
+        from data_collection.policies.play import PlayPolicy
+
+        return PlayPolicy()
+    if name == "noise":
+        from data_collection.policies.coloured_noise import NoisePolicy
+
+        return NoisePolicy()
+    if name == "random":
+        from data_collection.policies.random import RandomPolicy
+
+        return RandomPolicy()
+    raise UsageError(f"no policy named '{name}'; choose one of {', '.join(POLICIES)}")
+
+
+__all__ = ["POLICIES", "Policy", "make_policy"]

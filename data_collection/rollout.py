@@ -1,0 +1,78 @@
+"""One episode: a policy acts in an environment, and what happened becomes columns."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from data_collection.policies import Policy
+from data_collection.schema import COLUMNS, quantise_depth
+
+
+def collect_episode(
+    env: gymnasium.Env,
+    policy: Policy,
+    steps: int,
+    seed: int,
+    episode: int,
+    ground_truth: bool = False,
+    on_step: Callable[[], None] = lambda: None,
+) -> dict[str, NDArray[Any]]:
+    """Roll out one episode; the same arguments give the same episode, whatever came before.
+
+    Args:
+        env: from `make_env`.
+        policy: a fresh one.
+        steps: actions to execute; fewer if the environment terminates.
+        seed: of the run.
+        episode: number of the episode in the run.
+        ground_truth: also record segmentation and body poses.
+        on_step: called before every step.
+
+    Returns:
+        the columns of the schema, (steps + 1, ...) each.
+    """
+    env_seeds, policy_seeds = np.random.SeedSequence((seed, episode)).spawn(2)
+    obs, info = env.reset(seed=int(env_seeds.generate_state(1)[0] >> 1))
+    policy.reset(env, np.random.default_rng(policy_seeds))
+    space = env.action_space
+    assert isinstance(space, gymnasium.spaces.Box)
+    camera = env.unwrapped.camera  # type: ignore[attr-defined]
+    rows: dict[str, list[Any]] = defaultdict(list)
+    _record(rows, env, obs, info, ground_truth)
+    for _ in range(steps):
+        on_step()
+        action = np.asarray(policy.act(obs), np.float32)
+        if action.shape != space.shape or not np.isfinite(action).all():
+            raise ValueError(f"the policy gave action {action}; it must be {space.shape} finite numbers")
+        action = np.clip(action, space.low, space.high)
+        obs, reward, terminated, _, info = env.step(action)
+        rows["action"].append(action)
+        rows["reward"].append(reward)
+        _record(rows, env, obs, info, ground_truth)
+        if terminated:
+            break
+    rows["action"].append(np.zeros(space.shape))
+    rows["reward"].append(0.0)
+    rows["depth"] = [quantise_depth(frame, camera.near, camera.far) for frame in rows["depth"]]
+    return {name: np.stack(rows[name]).astype(COLUMNS[name].dtype) for name in COLUMNS if name in rows}
+
+
+def _record(
+    rows: dict[str, list[Any]], env: gymnasium.Env, obs: dict[str, Any], info: dict[str, Any], ground_truth: bool
+) -> None:
+    """Append one frame and the state of the world at it."""
+    inner: Any = env.unwrapped
+    for name in ("rgb", "depth", "proprio"):
+        rows[name].append(np.array(obs[name]))
+    rows["state"].append(inner.get_state())
+    if "scene_obs" in info:
+        rows["scene_obs"].append(np.array(info["scene_obs"]))
+    if ground_truth:
+        rows["segmentation"].append(inner.segmentation())
+        rows["body_pose"].append(inner.body_poses())

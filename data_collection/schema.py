@@ -1,0 +1,191 @@
+"""What a shard holds: columns, episode tables and attributes, and the checks made when one is opened.
+
+shard-00007.h5
+  rgb          (N, H, W, 3)    uint8
+  depth        (N, H, W)       uint16   quantised over [near, far], see `quantise_depth`
+  action       (N, A)          float32  row t: executed between frame t and t+1; zeros in an episode's last row
+  proprio      (N, P)          float32
+  state        (N, S)          float64  the simulator's full state
+  reward       (N,)            float32  row t: earned by action t; zero in an episode's last row
+  scene_obs    (N, O)          float32  optional: what the fixtures and objects do
+  segmentation (N, H, W)       uint8    optional: body ids, 0 = background
+  body_pose    (N, nbody, 7)   float32  optional: world position, unit quaternion wxyz
+  ep_len       (E,)            int64    rows of each episode: its actions + 1
+  ep_offset    (E,)            int64    first row of each episode
+  ep_index     (E,)            int64    number of the episode in its run; with the run's seed it fixes the episode
+  ep_hash      (E, 32)         uint8    SHA-256 of the episode's columns
+  attributes: numbers and JSON strings, `ATTRIBUTES`
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.errors import UsageError
+
+SCHEMA_VERSION = 1
+SHARD_PATTERN = "shard-*.h5"
+DEPTH_STEPS = 65535  # the largest uint16
+
+
+@dataclass(frozen=True)
+class Column:
+    """How a column is stored: dtype, and number of axes with that of the rows."""
+
+    dtype: str
+    ndim: int
+    required: bool = True
+
+
+COLUMNS: dict[str, Column] = {
+    "rgb": Column("uint8", 4),
+    "depth": Column("uint16", 3),
+    "action": Column("float32", 2),
+    "proprio": Column("float32", 2),
+    "state": Column("float64", 2),
+    "reward": Column("float32", 1),
+    "scene_obs": Column("float32", 2, required=False),
+    "segmentation": Column("uint8", 3, required=False),
+    "body_pose": Column("float32", 3, required=False),
+}
+GROUND_TRUTH = ("segmentation", "body_pose")
+EPISODE_TABLES = ("ep_len", "ep_offset", "ep_index", "ep_hash")
+
+NUMBERS = ("schema", "seed", "control_rate", "K", "world_T_camera", "near", "far")
+JSON_STRINGS = (
+    "env_id",
+    "env_kwargs",
+    "policy",
+    "camera",
+    "action_aggregation",
+    "action_scale",
+    "body_names",
+    "hand_body_ids",
+    "versions",
+    "gl_renderer",
+)
+ATTRIBUTES = NUMBERS + JSON_STRINGS
+MEANING = ("schema", "env_id", "env_kwargs", "control_rate", "camera", "action_aggregation", "action_scale")
+"""The attributes without which the columns mean something else; equal in all shards of a dataset."""
+
+
+class DamagedShard(UsageError):
+    """A shard that cannot be read; `inspect-dataset DIR --repair` moves it aside."""
+
+    def __init__(self, path: Path, reason: str) -> None:
+        self.reason = reason
+        super().__init__(f"{path} is damaged ({reason}); drop it with: inspect-dataset {path.parent} --repair")
+
+
+@dataclass(frozen=True, eq=False)
+class Shard:
+    """A shard's tables and attributes, read once; no file is held open."""
+
+    path: Path
+    columns: dict[str, tuple[int, ...]]
+    """name -> shape of one row"""
+    ep_len: NDArray[np.int64]
+    ep_offset: NDArray[np.int64]
+    ep_index: NDArray[np.int64]
+    ep_hash: NDArray[np.uint8]
+    attrs: dict[str, Any]
+
+    @property
+    def rows(self) -> int:
+        return int(self.ep_len.sum())
+
+
+def quantise_depth(metres: NDArray[Any], near: float, far: float) -> NDArray[np.uint16]:
+    """Depth in metres, any shape -> uint16 over [near, far], clipped to it."""
+    unit = (np.asarray(metres, np.float64) - near) / (far - near)
+    return np.rint(np.clip(unit, 0.0, 1.0) * DEPTH_STEPS).astype(np.uint16)
+
+
+def dequantise_depth(raw: NDArray[np.uint16], near: float, far: float) -> NDArray[np.float32]:
+    """uint16 over [near, far], any shape -> depth in metres, float32; off by half a quantisation step at most."""
+    metres = raw.astype(np.float32)
+    metres *= np.float32((far - near) / DEPTH_STEPS)
+    metres += np.float32(near)
+    return metres
+
+
+def encode_attributes(attrs: Mapping[str, Any]) -> dict[str, Any]:
+    """Python values -> numbers and JSON strings, as HDF5 stores them."""
+    return {name: np.asarray(value) if name in NUMBERS else json.dumps(value) for name, value in attrs.items()}
+
+
+def episode_hash(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
+    """SHA-256 over an episode's columns (names, shapes, stored bytes), in the order of the schema -> (32,) uint8."""
+    digest = hashlib.sha256()
+    for name in (name for name in COLUMNS if name in columns):
+        values = np.ascontiguousarray(columns[name])
+        digest.update(f"{name}{values.shape}{values.dtype}".encode())
+        digest.update(values.data)
+    return np.frombuffer(digest.digest(), np.uint8)
+
+
+def read_shard(path: Path) -> Shard:
+    """Read and check a shard's tables and attributes; the columns' values are left alone.
+
+    Raises:
+        DamagedShard: it does not open, or something that every shard has is missing or disagrees.
+        UsageError: it was written in another version of the schema.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            attrs = _read_attributes(path, file)
+            tables = {name: file[name][()] for name in EPISODE_TABLES if name in file}
+            columns = {name: (file[name].shape, str(file[name].dtype)) for name in file if name not in EPISODE_TABLES}
+    except (OSError, KeyError, RuntimeError, ValueError) as error:
+        if isinstance(error, UsageError):
+            raise
+        raise DamagedShard(path, _first_line(error)) from error
+    for name in EPISODE_TABLES:
+        if name not in tables:
+            raise DamagedShard(path, f"no table '{name}'")
+    rows = int(tables["ep_len"].sum())
+    starts = np.concatenate([[0], np.cumsum(tables["ep_len"])[:-1]]) if len(tables["ep_len"]) else tables["ep_len"]
+    if not np.array_equal(starts, tables["ep_offset"]):
+        raise DamagedShard(path, "ep_offset does not follow from ep_len")
+    for name, (shape, dtype) in columns.items():
+        expected = COLUMNS.get(name)
+        if expected is not None and (dtype != expected.dtype or len(shape) != expected.ndim):
+            wanted = f"{expected.dtype} of {expected.ndim} axes"
+            raise DamagedShard(path, f"column '{name}' is {dtype} {shape}, not {wanted}")
+        if shape[:1] != (rows,):
+            raise DamagedShard(path, f"column '{name}' has {shape[0] if shape else 0} rows, its episodes {rows}")
+    return Shard(path, {name: shape[1:] for name, (shape, _) in columns.items()}, **tables, attrs=attrs)
+
+
+def _read_attributes(path: Path, file: h5py.File) -> dict[str, Any]:
+    if "schema" not in file.attrs:
+        raise DamagedShard(path, "no attribute 'schema': not a shard of this project")
+    version = int(file.attrs["schema"])
+    if version != SCHEMA_VERSION:
+        raise UsageError(
+            f"{path} has schema version {version}, this program reads {SCHEMA_VERSION}; "
+            "collect the dataset again, or use the program version that wrote it"
+        )
+    missing = [name for name in ATTRIBUTES if name not in file.attrs]
+    if missing:
+        raise DamagedShard(path, f"no attribute {missing[0]!r}")
+    return {name: _decode(name, value) for name, value in file.attrs.items()}
+
+
+def _decode(name: str, value: Any) -> Any:
+    if isinstance(value, str):
+        return json.loads(value)
+    return value.item() if np.ndim(value) == 0 else np.asarray(value)
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

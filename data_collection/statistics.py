@@ -1,0 +1,111 @@
+"""What a dataset covers: ranges of its columns, the workspace reached, and what moved."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_collection.dataset import RGBDDataset
+
+VOXEL = 0.05  # metres: edge of the cells in which workspace coverage is counted
+
+SCENE_PARTS: dict[str, tuple[int, float]] = {
+    "slider": (0, 0.02),
+    "drawer": (1, 0.02),
+    "button": (2, 0.003),
+    "switch": (3, 0.01),
+    "bulb": (4, 0.5),
+    "led": (5, 0.5),
+}
+"""Part -> (its place in a tabletop's scene_obs, by how much it must move in an episode to count as moved)."""
+BLOCKS: dict[str, int] = {"block_red": 6, "block_blue": 12, "block_pink": 18}
+"""Block -> where its position (3) and Euler angles (3) start in a tabletop's scene_obs."""
+BLOCK_MOVED = 0.02  # metres
+
+
+def describe(dataset: RGBDDataset) -> dict[str, Any]:
+    """Counts, ranges and shares of a dataset, ready for JSON."""
+    lengths = dataset.episode_lengths
+    rows = int(lengths.sum())
+    report: dict[str, Any] = {
+        "env_id": dataset.attrs["env_id"],
+        "policy": dataset.attrs["policy"],
+        "seed": dataset.attrs["seed"],
+        "episodes": dataset.episodes,
+        "frames": rows,
+        "steps": rows - dataset.episodes,
+        "episode_steps": {"min": int(lengths.min()) - 1, "max": int(lengths.max()) - 1},
+        "hours": round((rows - dataset.episodes) / dataset.attrs["control_rate"] / 3600, 3),
+        "image_size": [dataset.camera.height, dataset.camera.width],
+        "bytes": sum(path.stat().st_size for path in dataset.files),
+        "content_hash": dataset.content_hash,
+        "columns": {name: column_range(dataset, name) for name in dataset.columns},
+    }
+    proprio = dataset.load("proprio")
+    if "workspace" in dataset.attrs and proprio.shape[1] >= 3:
+        report["workspace"] = workspace_coverage(proprio[:, :3], np.asarray(dataset.attrs["workspace"]))
+    if "scene_obs" in dataset.columns and "Tabletop" in str(dataset.attrs["env_id"]):
+        report["moved"] = moved_shares(dataset.load("scene_obs"), dataset.episode_slices)
+    return report
+
+
+def column_range(dataset: RGBDDataset, name: str) -> dict[str, Any]:
+    """Row shape, dtype and range of a column; depth in metres, flat columns number by number."""
+    values = dataset.load(name)
+    summary: dict[str, Any] = {"shape": list(values.shape), "dtype": str(values.dtype)}
+    if name == "depth":
+        low, high = dataset.depth_metres(np.array([values.min(), values.max()]))
+        return {**summary, "unit": "m", "min": round(float(low), 4), "max": round(float(high), 4)}
+    if values.ndim == 2 and name in ("action", "proprio", "scene_obs"):
+        return {
+            **summary,
+            "min": np.round(values.min(axis=0), 4).tolist(),
+            "max": np.round(values.max(axis=0), 4).tolist(),
+            "std": np.round(values.std(axis=0, dtype=np.float64), 4).tolist(),
+        }
+    return {**summary, "min": float(values.min()), "max": float(values.max())}
+
+
+def workspace_coverage(tcp: NDArray[Any], workspace: NDArray[Any]) -> dict[str, Any]:
+    """How much of the workspace the end-effector has been to.
+
+    Args:
+        tcp: (N, 3) positions in the world, metres.
+        workspace: (2, 3) low and high corner, metres.
+    """
+    low, high = workspace
+    cells = np.maximum(1, np.round((high - low) / VOXEL)).astype(int)
+    cell = np.minimum(((tcp - low) / (high - low) * cells).astype(np.int64), cells - 1)
+    inside = ((tcp >= low) & (tcp <= high)).all(axis=1)
+    counts = np.bincount(np.ravel_multi_index(tuple(cell[inside].T), tuple(cells)), minlength=int(np.prod(cells)))
+    visited = counts > 0
+    shares = counts[visited] / max(1, counts.sum())
+    return {
+        "cell_m": VOXEL,
+        "cells": cells.tolist(),
+        "share_of_cells_visited": round(float(visited.mean()), 4),
+        "share_of_frames_inside": round(float(inside.mean()), 4),
+        # 1 where all cells are visited equally often: the exponential of the entropy, as a share of the cells
+        "evenness": round(float(np.exp(-(shares * np.log(shares)).sum()) / len(counts)) if len(shares) else 0.0, 4),
+        "span_m": np.round(np.ptp(tcp, axis=0), 3).tolist(),
+    }
+
+
+def moved_shares(scene_obs: NDArray[Any], slices: NDArray[np.int64]) -> dict[str, float]:
+    """In which share of the episodes each fixture and block of a tabletop moved.
+
+    Args:
+        scene_obs: (N, 24), CALVIN's layout.
+        slices: (E, 2) first row and row past the last of each episode.
+    """
+    moved: dict[str, list[bool]] = {name: [] for name in (*SCENE_PARTS, *BLOCKS)}
+    for start, stop in slices:
+        episode = scene_obs[start:stop]
+        for name, (place, least) in SCENE_PARTS.items():
+            moved[name].append(bool(np.ptp(episode[:, place]) >= least))
+        for name, place in BLOCKS.items():
+            position = episode[:, place : place + 3]
+            moved[name].append(bool(np.linalg.norm(position - position[0], axis=1).max() >= BLOCK_MOVED))
+    return {name: round(float(np.mean(episodes)), 4) for name, episodes in moved.items()}

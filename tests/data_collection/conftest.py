@@ -1,0 +1,62 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+if str(HERE) not in sys.path:  # spawned workers inherit it and find `standin`
+    sys.path.insert(0, str(HERE))
+
+ENV_ID = "standin:standin/Square-v0"
+
+
+def options(out, **changed):
+    """Command line of `collect-rollouts` on the stand-in environment."""
+    chosen = {"env": ENV_ID, "episodes": 4, "steps": 8, "image-size": 16, "policy": "noise", "workers": 1, **changed}
+    flags = [flag for name, value in chosen.items() if value is not True for flag in (f"--{name}", str(value))]
+    return ["--out", str(out), *flags, *(f"--{name}" for name, value in chosen.items() if value is True)]
+
+
+def start(command, arguments, **variables):
+    """Start a command of the project in a process of its own."""
+    module = {"collect-rollouts": "collect", "inspect-dataset": "inspect_dataset"}[command]
+    code = f"from data_collection.{module} import command; command()"
+    environment = {**os.environ, "PYTHONPATH": str(HERE), **{k: str(v) for k, v in variables.items()}}
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def finish(process):
+    """Exit code, stdout and stderr of a started command."""
+    out, err = process.communicate(timeout=120)
+    return process.returncode, out, err
+
+
+def call(command, arguments, **variables):
+    """Run a command to its end."""
+    return finish(start(command, arguments, **variables))
+
+
+def assert_one_line_error(result, *words):
+    """Exit code 2 and one line that names these words; no traceback."""
+    code, _, err = result
+    lines = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert code == 2 and len(lines) == 1 and "Traceback" not in err, err
+    for word in words:
+        assert word in lines[0], f"{word!r} is not in {lines[0]!r}"
+
+
+@pytest.fixture(scope="session")
+def collected(tmp_path_factory):
+    """A dataset of four episodes with ground truth, by one worker; not to be changed."""
+    folder = tmp_path_factory.mktemp("collected") / "data"
+    code, _, err = call("collect-rollouts", options(folder, **{"ground-truth": True}))
+    assert code == 0, err
+    return folder
