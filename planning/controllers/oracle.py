@@ -1,0 +1,41 @@
+"""The same planner with the simulator as its model: the upper bound."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from envs.tabletop.simulate import rollout_tcp
+from numpy.typing import NDArray
+
+from planning.controllers.base import Observation, PlanningController
+from planning.costs import discounted_distance, env_action
+from planning.icem import ICEM, CostFunction
+
+
+class OracleController(PlanningController):
+    """Plans in copies of the simulator's state. It alone is given the environment.
+
+    Args:
+        env: the tabletop environment that is being controlled.
+        planner: searches sequences of translations.
+        hold: control steps that each translation is held for.
+    """
+
+    name = "oracle"
+
+    def __init__(self, env: gym.Env, planner: ICEM, hold: int) -> None:
+        super().__init__(planner, hold)
+        self.simulator: Any = env.unwrapped
+
+    def imagine(self, observation: Observation) -> CostFunction:
+        state = self.simulator.get_state()
+
+        def cost(sequences: NDArray) -> NDArray:
+            actions = np.repeat(env_action(sequences, self.gripper), self.hold, axis=1)  # (N, h * hold, 7)
+            path = rollout_tcp(self.simulator, np.tile(state, (len(sequences), 1)), actions)
+            reached = path[:, self.hold - 1 :: self.hold]  # (N, h, 3), after each held translation
+            return discounted_distance(np.linalg.norm(reached - self.goal.point_world, axis=-1))
+
+        return cost

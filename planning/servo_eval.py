@@ -1,0 +1,189 @@
+"""`servo-eval`: how often controllers bring the arm to a 3D point, on the same setups for all of them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import gymnasium as gym
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+import envs.command
+from data_collection.files import locked, write_json
+from envs.errors import UsageError
+from planning.controllers import CONTROLLERS, LEARNED, Kit
+from planning.episode import Record, run_episode
+from planning.film import Film
+from planning.icem import ICEMConfig
+from planning.records import EpisodeLog
+from planning.report import bar_chart, summarise, table
+from planning.setups import Setup, make_setup
+
+EPISODE_ENTROPY = 0xE9150DE  # sets the planners' randomness apart from the setups'
+
+
+@dataclass(frozen=True)
+class ServoConfig:
+    """Let controllers servo the arm to random 3D points and report how often they arrive.
+
+    An episode succeeds if the end-effector is within 10 % of its initial distance to the goal for at least 5 control
+    steps. The same command again goes on where a stopped run ended.
+    """
+
+    out: Path
+    """folder for servo.json, episodes.jsonl, the bar chart and the videos"""
+    model: tuple[str, ...] = ("t3vip",)
+    """controllers to compare"""
+    checkpoint: tuple[str, ...] = ()
+    """weights to use instead of the shipped ones: a checkpoint folder, or MODEL=FOLDER for each of several models"""
+    episodes: int = 50
+    """episodes per model, each in a setup of its own"""
+    setups: int | None = None
+    """distinct setups; with --repeats in place of --episodes"""
+    repeats: int = 1
+    """episodes per setup; --setups 10 --repeats 5 is the paper's protocol"""
+    scene: Literal["A", "B", "C", "D"] = "D"
+    """tabletop scene; the shipped models have never seen D"""
+    steps: int = 100
+    """budget of control steps per episode"""
+    seed: int = 0
+    """of the setups and the planners"""
+    image_size: int = 64
+    """pixels; what the world model was trained on"""
+    hold: int = 3
+    """control steps that a planned translation is held for; a world model holds for its frame gap"""
+    planner: Annotated[ICEMConfig, tyro.conf.arg(name="planner")] = field(default_factory=ICEMConfig)
+    deadline: float | None = None
+    """seconds after which a plan must be there"""
+    video: int = 0
+    """episodes per model to film"""
+    device: str = "cpu"
+    """where world models run, e.g. cpu or cuda"""
+
+    def __post_init__(self) -> None:
+        for name in self.model:
+            if name not in CONTROLLERS:
+                raise UsageError(f"unknown model '{name}'; known are {', '.join(CONTROLLERS)}")
+        if not self.model or len(set(self.model)) < len(self.model):
+            raise UsageError(f"--model is {' '.join(self.model) or 'empty'}; name each model once")
+        for option in ("episodes", "repeats", "steps", "image_size", "hold"):
+            if getattr(self, option) < 1:
+                raise UsageError(f"--{option.replace('_', '-')} is {getattr(self, option)}; give at least 1")
+        if self.setups is not None and self.setups < 1:
+            raise UsageError(f"--setups is {self.setups}; give at least 1")
+        if self.seed < 0 or self.video < 0:
+            raise UsageError(f"--seed is {self.seed}, --video is {self.video}; give 0 or more")
+        if self.deadline is not None and not self.deadline > 0:
+            raise UsageError(f"--deadline is {self.deadline}; give a positive number of seconds")
+        self.checkpoints()
+
+    def checkpoints(self) -> dict[str, str]:
+        """World model -> its weights, as given."""
+        learned = [name for name in self.model if name in LEARNED]
+        given: dict[str, str] = {}
+        for entry in self.checkpoint:
+            name, separator, path = entry.partition("=")
+            if not separator:
+                if len(learned) != 1:
+                    raise UsageError(
+                        f"--checkpoint {entry} fits {' or '.join(learned) or 'no model of this run'};"
+                        " say MODEL=FOLDER for a model that learns"
+                    )
+                name, path = learned[0], entry
+            if name not in learned:
+                raise UsageError(f"--checkpoint {entry} is for '{name}'; learned models of this run: {learned}")
+            given[name] = path
+        return given
+
+    def attempts(self) -> list[tuple[int, int]]:
+        """(setup, repeat) of every episode of a model."""
+        setups = self.setups if self.setups is not None else -(-self.episodes // self.repeats)
+        pairs = [(setup, repeat) for setup in range(setups) for repeat in range(self.repeats)]
+        return pairs if self.setups is not None else pairs[: self.episodes]
+
+
+def main(config: ServoConfig) -> None:
+    """Run what is missing, then report on everything."""
+    env = gym.make(f"envs:t3vip/Tabletop{config.scene}-v0", image_size=config.image_size, max_episode_steps=-1)
+    try:
+        kit = Kit(env, config.planner, config.hold, config.checkpoints(), config.device, config.deadline)
+        learned = {name: kit.model(name) for name in config.model if name in LEARNED}
+        kit.hold = next((model.frame_gap for model in learned.values()), config.hold)
+        config.out.mkdir(parents=True, exist_ok=True)
+        with locked(config.out):
+            log = EpisodeLog(config.out, settings(config, kit.hold, learned))
+            for record in run_missing(config, env, kit, log):
+                log.append(record)
+            report(config, log)
+    finally:
+        env.close()
+
+
+def settings(config: ServoConfig, hold: int, learned: dict[str, Any]) -> dict[str, Any]:
+    """What an episode's outcome depends on, apart from its model, setup and repeat."""
+    kept = {name: getattr(config, name) for name in ("scene", "steps", "seed", "image_size", "deadline")}
+    weights = {name: weights_hash(model) for name, model in learned.items()}
+    return {**kept, "hold": hold, "planner": asdict(config.planner), "checkpoints": weights}
+
+
+def weights_hash(model: Any) -> str:
+    """Names a model by its weights."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(model.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().float().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+def run_missing(config: ServoConfig, env: gym.Env, kit: Kit, log: EpisodeLog) -> Iterator[Record]:
+    """The episodes that the log does not hold yet, setup by setup, all models on the same one."""
+    todo = [
+        (setup, repeat, name)
+        for setup, repeat in config.attempts()
+        for name in config.model
+        if (name, setup, repeat) not in log.records
+    ]
+    done = len(config.model) * len(config.attempts()) - len(todo)
+    setup: Setup | None = None
+    with tqdm(todo, total=done + len(todo), initial=done, unit="episode", desc="servo") as progress:
+        for index, repeat, name in progress:
+            if setup is None or setup.index != index:
+                setup = make_setup(env, index, config.seed)
+            entropy = (EPISODE_ENTROPY, config.seed, index, repeat)
+            kit.rng = np.random.default_rng(np.random.SeedSequence(entropy))
+            filmed = index * config.repeats + repeat < config.video
+            film = Film(env, setup, name) if filmed else None
+            record = run_episode(
+                env, setup, CONTROLLERS[name](kit), config.steps, repeat, film.watch if film is not None else None
+            )
+            if film is not None:
+                film.save(config.out / "videos" / f"{name}-setup{index:02d}-{repeat}")
+            progress.set_postfix_str(f"{name}: {100 * record.final_distance:.1f} cm left")
+            yield record
+
+
+def report(config: ServoConfig, log: EpisodeLog) -> None:
+    """Write servo.json and the chart; print the table. Only the episodes that this command asks for count."""
+    models = {
+        name: summarise([log.records[name, setup, repeat] for setup, repeat in config.attempts()])
+        for name in config.model
+    }
+    title = f"servo on scene {config.scene}, {len(config.attempts())} episodes each"
+    write_json(config.out / "servo.json", {"scene": config.scene, "seed": config.seed, "models": models})
+    bar_chart(models, config.out / "success.png", title)
+    print(table(models))
+    print(f"written to {config.out}: servo.json, success.png, episodes.jsonl")
+
+
+def command() -> None:
+    """Console script."""
+    envs.command.run(ServoConfig, main)
+
+
+if __name__ == "__main__":
+    command()

@@ -1,0 +1,125 @@
+"""Servo setups: a scene, an arm pose, and a goal that can be reached and seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from envs.tabletop.simulate import rollout_tcp
+from numpy.typing import NDArray
+
+from planning.controllers.base import Goal, Observation, held_gripper
+from planning.controllers.baselines import METRES_PER_ACTION
+from planning.costs import env_action
+
+SETUP_ENTROPY = 0x5E7_0_90A1  # sets the seeds of setups apart from every seed that makes training data
+SEED_OFFSET = 2**62  # environments of setups are seeded above it, those of training data below
+
+NEAREST, FARTHEST = 0.20, 0.45  # metres from the TCP to the goal
+NEAREST_PIXELS = 12.0  # and in the picture
+BORDER_PIXELS = 3.0  # from the goal to the edge of the picture
+CLEARANCE = 0.02  # metres that the goal stands in front of every surface the camera sees around it
+STEPS, TRAVEL_STEPS = 100, 60  # of the straight-line motion that proves a goal reachable; the rest it stands
+REACHED = 0.025  # of the way may be left while it stands
+GOALS_PER_SCENE = 40  # tries before the scene is drawn anew
+SCENES = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """Where an episode starts and where it is to go.
+
+    Attributes:
+        index: of the setup; with the seed of the evaluation it determines all else.
+        env_seed: what the environment is reset with.
+        state: simulator state after that reset.
+        goal: where the TCP is to go.
+        distance: metres from the TCP to the goal at the start.
+        pixel_distance: the same in the picture, pixels.
+        axis_share: share of the way that lies along the optical axis, in [0, 1].
+    """
+
+    index: int
+    env_seed: int
+    state: NDArray[np.float64]
+    goal: Goal
+    distance: float
+    pixel_distance: float
+    axis_share: float
+
+    def start(self, env: gym.Env) -> Observation:
+        """Put the environment where the setup begins; returns the first observation."""
+        tabletop: Any = env.unwrapped
+        env.reset(seed=self.env_seed)
+        tabletop.set_state(self.state)
+        return tabletop.observation()
+
+
+def make_setup(env: gym.Env, index: int, seed: int = 0) -> Setup:
+    """The setup of that index; the same for every model, every run and every number of setups.
+
+    Args:
+        env: a tabletop environment that renders; its state is changed.
+        index: which setup.
+        seed: of the evaluation.
+
+    Raises:
+        RuntimeError: no goal was found, which means that the environment is broken.
+    """
+    tabletop: Any = env.unwrapped
+    rng = np.random.default_rng(np.random.SeedSequence((SETUP_ENTROPY, seed, index)))
+    for _ in range(SCENES):
+        env_seed = SEED_OFFSET + int(rng.integers(2**32))
+        observation, _ = env.reset(seed=env_seed)
+        state, tcp = tabletop.get_state(), np.array(tabletop.tcp_position)
+        gripper = held_gripper(observation)
+        for _ in range(GOALS_PER_SCENE):
+            goal = _draw_goal(tabletop, tcp, rng)
+            if not _in_sight(tabletop, goal, tcp, observation["depth"]):
+                continue
+            if _reachable(tabletop, state, gripper, goal, tcp):
+                return _measured(tabletop, index, env_seed, state, goal, tcp)
+    raise RuntimeError(f"no reachable goal in {SCENES} scenes for setup {index} of seed {seed}")
+
+
+def _draw_goal(tabletop: Any, tcp: NDArray, rng: np.random.Generator) -> Goal:
+    """A point of the workspace at a uniform distance and direction from the TCP (rejected outside)."""
+    low, high = tabletop.workspace
+    while True:
+        direction = rng.standard_normal(3)
+        point = tcp + rng.uniform(NEAREST, FARTHEST) * direction / np.linalg.norm(direction)
+        if np.all(point >= low) and np.all(point <= high):
+            camera = tabletop.camera
+            return Goal(point, camera.project(camera.to_camera(point)))
+
+
+def _in_sight(tabletop: Any, goal: Goal, tcp: NDArray, depth: NDArray) -> bool:
+    """Whether the goal is well inside the picture, far from the TCP in it, and in front of what stands there."""
+    camera = tabletop.camera
+    if np.linalg.norm(goal.pixel - camera.project(camera.to_camera(tcp))) < NEAREST_PIXELS:
+        return False
+    border = BORDER_PIXELS
+    if np.any(goal.pixel < border) or np.any(goal.pixel > np.array([camera.width, camera.height]) - 1 - border):
+        return False
+    u, v = np.rint(goal.pixel).astype(int)
+    around = depth[v - 1 : v + 2, u - 1 : u + 2]
+    return camera.to_camera(goal.point_world)[2] + CLEARANCE < around.min()
+
+
+def _reachable(tabletop: Any, state: NDArray, gripper: float, goal: Goal, tcp: NDArray) -> bool:
+    """Whether the straight way leads there in a copy of the simulator: neither goal nor way is inside furniture."""
+    moves = np.zeros((STEPS, 3))
+    moves[:TRAVEL_STEPS] = (goal.point_world - tcp) / TRAVEL_STEPS / METRES_PER_ACTION
+    path = rollout_tcp(tabletop, state[None], env_action(moves, gripper)[None])[0]
+    left = np.linalg.norm(path - goal.point_world, axis=-1)
+    return bool(np.all(left[-5:] <= REACHED * np.linalg.norm(goal.point_world - tcp)))
+
+
+def _measured(tabletop: Any, index: int, env_seed: int, state: NDArray, goal: Goal, tcp: NDArray) -> Setup:
+    camera = tabletop.camera
+    way = camera.to_camera(goal.point_world) - camera.to_camera(tcp)
+    distance = float(np.linalg.norm(way))
+    pixels = float(np.linalg.norm(goal.pixel - camera.project(camera.to_camera(tcp))))
+    return Setup(index, env_seed, state, goal, distance, pixels, float(abs(way[2]) / distance))
