@@ -63,6 +63,7 @@ class EGLContext:
         if not self._context:
             raise RuntimeError("EGL makes no OpenGL context")
         self._egl.eglGetCurrentContext.restype = ctypes.c_void_p
+        _show_to_mujoco(self._egl)
 
     def _initialised_display(self) -> int:
         count = ctypes.c_int()
@@ -132,6 +133,7 @@ class OSMesaContext:
         if not self._context:
             raise RuntimeError("OSMesa makes no context")
         self._buffer = (ctypes.c_ubyte * 4)()  # the default framebuffer, never drawn to: MuJoCo makes its own
+        _show_to_mujoco(self._osmesa)
 
     def make_current(self) -> None:
         """Send this thread's OpenGL calls here."""
@@ -183,11 +185,19 @@ def create_context() -> EGLContext | OSMesaContext:
 
 
 def _load(*names: str) -> ctypes.CDLL:
-    """The first of these libraries that is there, visible to MuJoCo's loader of OpenGL functions."""
+    """The first of these libraries that is there."""
     for name in names:
         with contextlib.suppress(OSError):
-            return ctypes.CDLL(name, mode=ctypes.RTLD_GLOBAL)
+            return ctypes.CDLL(name)
     raise OSError(f"{names[0]} is not installed")
+
+
+def _show_to_mujoco(library: ctypes.CDLL) -> None:
+    """Let MuJoCo's loader of OpenGL functions see a library that works.
+
+    Not before it has shown to work: the loader would ask an EGL without context rather than the OSMesa that replaces it.
+    """
+    ctypes.CDLL(library._name, mode=ctypes.RTLD_GLOBAL)
 
 
 def _text(value: bytes | None) -> str:

@@ -14,7 +14,7 @@ from envs.camera import CameraModel
 from planning.controllers.base import Goal, Observation, PlanningController, tcp_position
 from planning.costs import discounted_distance, env_action
 from planning.icem import ICEM, CostFunction
-from planning.tracking import HAND_RADIUS, HandTrack
+from worldmodel.tracking import HAND_RADIUS, HandTrack
 
 
 class T3VIPController(PlanningController):
