@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import re
 import sys
 from collections.abc import Callable, Sequence
 from typing import TypeVar
@@ -17,7 +20,8 @@ def run(config: type[Config], main: Callable[[Config], None], args: Sequence[str
     """Parse the command line into `config` and hand it to `main`.
 
     A `UsageError`, from the options' own checks or from `main`, ends the process with one line on stderr and exit
-    code 2; Ctrl-C ends it with 130. Anything else is a bug and keeps its traceback.
+    code 2; so does an option that cannot be parsed; Ctrl-C ends it with 130. Anything else is a bug and keeps its
+    traceback.
 
     Args:
         config: a dataclass whose field docstrings are the help text.
@@ -25,10 +29,37 @@ def run(config: type[Config], main: Callable[[Config], None], args: Sequence[str
         args: the arguments; those of the process when None.
     """
     try:
-        main(tyro.cli(config, args=args, description=config.__doc__))
+        main(parse(config, args))
     except UsageError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def parse(config: type[Config], args: Sequence[str] | None = None) -> Config:
+    """The options of a command.
+
+    Raises:
+        UsageError: they do not parse, or `config` refuses them.
+    """
+    box = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(box):
+            return tyro.cli(config, args=args, description=config.__doc__)
+    except SystemExit as stop:
+        if stop.code != 2:  # --help
+            raise
+        cause: BaseException | None = stop
+        while cause is not None and not isinstance(cause, UsageError):
+            cause = cause.__context__
+    raise cause or UsageError(_one_line(box.getvalue()))
+
+
+def _one_line(box: str) -> str:
+    """What tyro says in a frame: its first paragraph, as one line."""
+    lines = [line.strip("│ \t") for line in box.splitlines() if line.startswith("│")]
+    paragraph = lines[: next((i for i, line in enumerate(lines) if line.startswith("─")), None)]
+    said = re.sub(r"\s+", " ", " ".join(paragraph))
+    return f"{said.rstrip('.')}; --help lists the options"
