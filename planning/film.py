@@ -35,9 +35,10 @@ class Film:
     """
 
     def __init__(self, env: gym.Env, setup: Setup, caption: str) -> None:
-        self._tabletop: Any = env.unwrapped
-        near, far = self._tabletop.camera.near, self._tabletop.camera.far
-        self._cameras = [StaticCamera(self._tabletop.mj_model, view, SIZE, SIZE, near, far, 2) for view in VIEWS]
+        tabletop: Any = env.unwrapped
+        self._tabletop = tabletop
+        model, camera = tabletop.mj_model, tabletop.camera
+        self._cameras = [StaticCamera(model, view, SIZE, SIZE, camera.near, camera.far) for view in VIEWS]
         self._setup, self._caption = setup, caption
         self._path: list[NDArray] = []
         self.frames: list[NDArray[np.uint8]] = []

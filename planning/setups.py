@@ -84,12 +84,12 @@ def make_setup(env: gym.Env, index: int, seed: int = 0) -> Setup:
     raise RuntimeError(f"no reachable goal in {SCENES} scenes for setup {index} of seed {seed}")
 
 
-def _draw_goal(tabletop: Any, tcp: NDArray, rng: np.random.Generator) -> Goal:
+def _draw_goal(tabletop: Any, tcp: NDArray[np.float64], rng: np.random.Generator) -> Goal:
     """A point of the workspace at a uniform distance and direction from the TCP (rejected outside)."""
     low, high = tabletop.workspace
     while True:
         direction = rng.standard_normal(3)
-        point = tcp + rng.uniform(NEAREST, FARTHEST) * direction / np.linalg.norm(direction)
+        point: NDArray[np.float64] = tcp + rng.uniform(NEAREST, FARTHEST) * direction / np.linalg.norm(direction)
         if np.all(point >= low) and np.all(point <= high):
             camera = tabletop.camera
             return Goal(point, camera.project(camera.to_camera(point)))

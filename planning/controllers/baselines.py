@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.tabletop.control import ACTION_SCALE
 from planning.controllers.base import Goal, HoldingController, Observation, PlanningController, tcp_position
 from planning.costs import discounted_distance
 from planning.icem import CostFunction
 
-METRES_PER_ACTION = 0.02  # of a full translation over one control step
+METRES_PER_ACTION = ACTION_SCALE[0]  # of a full translation over one control step
 
 
 class RandomController(HoldingController):

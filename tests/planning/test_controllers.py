@@ -1,0 +1,108 @@
+"""Controllers in a world of arrays: they get observations, the camera's geometry and the goal, nothing else."""
+
+import numpy as np
+import pytest
+
+from planning.controllers.base import HoldingController
+from planning.controllers.baselines import LinearController, ProportionalController, RandomController
+from planning.controllers.t3vip import T3VIPController
+from planning.icem import ICEM, ICEMConfig
+
+
+def planner(seed=0, **options):
+    return ICEM(ICEMConfig(**{"horizon": 4, **options}), -np.ones(3), np.ones(3), np.random.default_rng(seed))
+
+
+def servo(controller, world, goal, steps=60):
+    observation = world.observation()
+    controller.reset(observation, goal)
+    distances = []
+    for _ in range(steps):
+        observation = world.step(controller.act(observation))
+        distances.append(np.linalg.norm(world.tcp - goal.point_world))
+    return np.array(distances)
+
+
+def test_t3vip_arrives_with_an_exact_model(exact_model, camera, world, goal):
+    controller = T3VIPController(exact_model, camera, planner())
+    distances = servo(controller, world, goal)
+    assert (distances <= 0.1 * 0.27).sum() >= 5 and distances[-1] < 0.03
+    assert len(controller.plan_seconds) == 20  # once per frame gap
+
+
+def test_t3vip_needs_its_model(make_exact_model, camera, world, goal):
+    """With the action's numbers mixed up before the model, the arm gets nowhere."""
+    model = make_exact_model(camera, channels=(1, 2, 0, 3, 4, 5, 6))
+    distances = servo(T3VIPController(model, camera, planner()), world, goal)
+    assert distances.min() > 0.1 * 0.27
+
+
+@pytest.mark.parametrize("context", [1, 2, 3])
+def test_the_model_sees_frames_a_gap_apart_with_the_actions_between(exact_model, camera, world, goal, context):
+    executed = []
+    controller = T3VIPController(exact_model, camera, planner(), context_frames=context)
+    observation = world.observation()
+    controller.reset(observation, goal)
+    for _ in range(10):
+        action = controller.act(observation)
+        executed.append(action)
+        observation = world.step(action)
+    assert len(exact_model.shown) == 4
+    for plan, (rgb, depth, actions) in enumerate(exact_model.shown):
+        frames = [max(0, 3 * (plan - back)) for back in reversed(range(context))]  # the world counts steps in grey
+        np.testing.assert_allclose(255 * rgb[0, :, 0, 0, 0], frames, atol=1e-4)
+        assert rgb.shape == (1, context, 3, 64, 64) and depth.shape == (1, context, 1, 64, 64)
+        for back in range(context - 1):
+            first = 3 * (plan - back - 1)
+            total = np.sum(executed[first : first + 3], axis=0) if first >= 0 else np.zeros(7)
+            total[6] = -1
+            np.testing.assert_allclose(actions[0, context - 2 - back], total, atol=1e-6)
+
+
+def test_planned_actions_are_translations_held_for_the_gap(exact_model, camera, world, goal):
+    controller = T3VIPController(exact_model, camera, planner())
+    servo(controller, world, goal, steps=1)
+    assert [len(action) for action in exact_model.asked] == [40] * 4 + [32] * 4 + [25] * 4
+    for action in exact_model.asked:
+        assert (action[:, 3:6] == 0).all() and (action[:, 6] == -1).all()
+        assert 1 < action[:, :3].abs().max() <= 3 + 1e-6
+
+
+def test_model_rollouts_keep_no_gradient(exact_model, camera, world, goal):
+    servo(T3VIPController(exact_model, camera, planner()), world, goal, steps=1)
+    assert all(not action.requires_grad for action in exact_model.asked)
+
+
+def test_proportional_arrives_and_holds_the_gripper(world, goal):
+    distances = servo(ProportionalController(), world, goal)
+    assert distances[-1] < 1e-3
+    controller = ProportionalController()
+    controller.reset(world.observation(), goal)
+    assert controller.act(world.observation())[6] == -1
+
+
+def test_linear_learns_the_arm_within_the_episode(world, goal):
+    """Whatever the axes: here they are turned and unequal, which the controller cannot know."""
+    mixed = np.array([[0, 0.8, 0], [-0.7, 0, 0.2], [0, 0, 0.9]])
+    straight = world.step
+
+    def step(action):
+        return straight(np.concatenate([mixed @ action[:3], action[3:]]).astype(np.float32))
+
+    world.step = step
+    distances = servo(LinearController(planner(), hold=3), world, goal, steps=100)
+    assert distances[-10:].mean() < 0.03
+
+
+def test_random_is_uniform_and_held(world, goal):
+    controller = RandomController(3, np.random.default_rng(0))
+    observation = world.observation()
+    controller.reset(observation, goal)
+    actions = np.array([controller.act(observation) for _ in range(900)])
+    np.testing.assert_array_equal(actions[0::3], actions[2::3])
+    assert np.abs(actions[:, :3].mean()) < 0.05 and actions[:, :3].std() == pytest.approx(1 / np.sqrt(3), abs=0.03)
+
+
+def test_holding_is_an_interface():
+    with pytest.raises(NotImplementedError):
+        HoldingController(3).decide({})

@@ -1,0 +1,94 @@
+"""The hand is found, and followed exactly where the transforms are exact."""
+
+import numpy as np
+import pytest
+import torch
+
+from envs.camera import CameraModel
+from worldmodel.tracking import HandTrack, hand_pixels
+
+BACKGROUND, HAND = 4.6, 4.2  # metres
+
+
+@pytest.fixture
+def camera() -> CameraModel:
+    return CameraModel.from_fovy(64, 64, 10.0, np.eye(4), 3.5, 5.5)
+
+
+def scene(camera, corner=(20, 24), size=6):
+    """A square hand in front of a wall; the TCP lies below it, where the camera sees the wall."""
+    depth = np.full((64, 64), BACKGROUND)
+    u, v = corner
+    depth[v : v + size, u : u + size] = HAND
+    points = torch.from_numpy(camera.unproject(depth)).permute(2, 0, 1)
+    tcp = camera.unproject(np.full((64, 64), HAND))[v + size + 1, u + size // 2]
+    return points, torch.from_numpy(tcp)
+
+
+def square(transform_inside, corner, size=6, batch=2):
+    field = torch.eye(3, 4, dtype=torch.float64)[None, :, :, None, None].repeat(batch, 1, 1, 64, 64)
+    u, v = corner
+    field[..., v : v + size, u : u + size] = transform_inside[None, :, :, None, None]
+    return field
+
+
+def intrinsics(camera):
+    return torch.from_numpy(np.array(camera.K))
+
+
+def test_hand_pixels_are_those_near_the_tcp_in_space(camera):
+    points, tcp = scene(camera)
+    found = torch.zeros(64, 64, dtype=torch.bool)
+    found.view(-1)[hand_pixels(points, tcp)] = True
+    assert found[24:30, 20:26].sum() == found.sum() > 15  # on the hand only, never on the wall behind the TCP
+    v, u = divmod(int(hand_pixels(points, tcp)[-1]), 64)
+    assert (points[:, v, u] - tcp).norm() <= 0.06
+
+
+def test_a_hidden_hand_takes_the_nearest_points(camera):
+    _, tcp = scene(camera)
+    wall = torch.from_numpy(camera.unproject(np.full((64, 64), BACKGROUND))).permute(2, 0, 1)
+    found = hand_pixels(wall, tcp, least=9)
+    distances = (wall - tcp[:, None, None]).norm(dim=0).flatten()
+    assert len(found) == 9 and distances[found].max() <= distances.kthvalue(9).values
+
+
+def test_follows_the_hand_across_the_picture_exactly(camera):
+    """Transforms move the square only; the track must read them where the square has gone."""
+    points, tcp = scene(camera)
+    track = HandTrack.start(points, tcp, intrinsics(camera), futures=2)
+    corner, true = (20, 24), tcp.clone()
+    for du, dv in [(6, 0), (3, 5), (0, -8)]:  # whole pixels, farther than the hand is wide
+        shift = torch.tensor([du * HAND / camera.K[0, 0], dv * HAND / camera.K[1, 1], 0.0], dtype=torch.float64)
+        moved = torch.cat([torch.eye(3, dtype=torch.float64), shift[:, None]], dim=1)
+        track = track.advance(square(moved, corner))
+        corner, true = (corner[0] + du, corner[1] + dv), true + shift
+        np.testing.assert_allclose(track.tcp, true.expand(2, 3), atol=1e-9)
+
+
+def test_rotation_and_motion_in_depth_move_the_tcp_as_part_of_the_body(camera):
+    points, tcp = scene(camera)
+    angle = 0.3
+    turn = torch.tensor(
+        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]], dtype=torch.float64
+    )
+    pivot, shift = torch.tensor([0.0, 0.0, HAND], dtype=torch.float64), torch.tensor([0.0, 0.01, 0.05])
+    transform = torch.cat([turn, (pivot - turn @ pivot + shift)[:, None]], dim=1)
+    everywhere = transform[None, :, :, None, None].expand(3, 3, 4, 64, 64)
+    track = HandTrack.start(points, tcp, intrinsics(camera), futures=3)
+    expected = tcp
+    for _ in range(2):
+        track = track.advance(everywhere)
+        expected = turn @ (expected - pivot) + pivot + shift
+    np.testing.assert_allclose(track.tcp, expected.expand(3, 3), atol=1e-9)
+
+
+def test_futures_are_apart_and_points_off_the_picture_do_no_harm(camera):
+    points, tcp = scene(camera)
+    track = HandTrack.start(points, tcp, intrinsics(camera), futures=2)
+    far = torch.eye(3, 4, dtype=torch.float64).repeat(2, 1, 1)
+    far[1, :, 3] = torch.tensor([-5.0, 3.0, 0.0])
+    field = far[..., None, None].expand(2, 3, 4, 64, 64)
+    track = track.advance(field).advance(field)
+    np.testing.assert_allclose(track.tcp[0], tcp)
+    np.testing.assert_allclose(track.tcp[1], tcp + 2 * far[1, :, 3])
