@@ -59,8 +59,8 @@ class Config:
     """Also write the findings to this file."""
 
     def __post_init__(self) -> None:
-        if self.size < 8:
-            raise UsageError(f"--size is {self.size}; give at least 8 pixels")
+        if not 32 <= self.size <= 1024:
+            raise UsageError(f"--size is {self.size}; give 32 to 1024 pixels")
         if not 0 < self.seconds <= 60:
             raise UsageError(f"--seconds is {self.seconds}; give more than 0 and at most 60")
 

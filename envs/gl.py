@@ -195,7 +195,7 @@ def _load(*names: str) -> ctypes.CDLL:
 def _show_to_mujoco(library: ctypes.CDLL) -> None:
     """Let MuJoCo's loader of OpenGL functions see a library that works.
 
-    Not before it has shown to work: the loader would ask an EGL without context rather than the OSMesa that replaces it.
+    Not before it has shown to work: the loader would ask a lifeless EGL rather than the OSMesa that stands in for it.
     """
     ctypes.CDLL(library._name, mode=ctypes.RTLD_GLOBAL)
 
