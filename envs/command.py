@@ -16,7 +16,12 @@ from envs.errors import UsageError
 Config = TypeVar("Config")
 
 
-def run(config: type[Config], main: Callable[[Config], None], args: Sequence[str] | None = None) -> None:
+def run(
+    config: type[Config],
+    main: Callable[[Config], None],
+    args: Sequence[str] | None = None,
+    default: Callable[[Sequence[str]], Config] | None = None,
+) -> None:
     """Parse the command line into `config` and hand it to `main`.
 
     A `UsageError`, from the options' own checks or from `main`, ends the process with one line on stderr and exit
@@ -27,9 +32,10 @@ def run(config: type[Config], main: Callable[[Config], None], args: Sequence[str
         config: a dataclass whose field docstrings are the help text.
         main: what the command does.
         args: the arguments; those of the process when None.
+        default: makes, from the arguments, the options that hold where the command line is silent (a preset).
     """
     try:
-        main(parse(config, args))
+        main(parse(config, args, default))
     except UsageError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
@@ -38,7 +44,11 @@ def run(config: type[Config], main: Callable[[Config], None], args: Sequence[str
         sys.exit(130)
 
 
-def parse(config: type[Config], args: Sequence[str] | None = None) -> Config:
+def parse(
+    config: type[Config],
+    args: Sequence[str] | None = None,
+    default: Callable[[Sequence[str]], Config] | None = None,
+) -> Config:
     """The options of a command.
 
     Raises:
@@ -47,7 +57,10 @@ def parse(config: type[Config], args: Sequence[str] | None = None) -> Config:
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            return tyro.cli(config, args=args, description=config.__doc__)
+            if default is None:
+                return tyro.cli(config, args=args, description=config.__doc__)
+            given = sys.argv[1:] if args is None else args
+            return tyro.cli(config, args=given, description=config.__doc__, default=default(given))
     except SystemExit as stop:
         if stop.code != 2:  # --help
             raise

@@ -1,0 +1,186 @@
+"""Checkpoints that are whole or not there.
+
+    RUN/
+      config.json                 options of the run
+      metrics.jsonl               one line an interval
+      model/                      the best model so far by validation score; what `load_model` reads
+        config.json               architecture, context, and where it came from
+        model.safetensors
+      checkpoints/step-00001000/  enough to go on exactly
+        training.safetensors      weights of model and inference network, Adam's moments
+        state.json                step, best score; written last
+
+A folder is written aside, flushed to disk and renamed, so a killed process leaves the last whole one. Every random draw
+of a step comes from the run's seed and the step's number: there is no generator state to save.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from envs.errors import UsageError
+from worldmodel.config import ModelConfig, ModelContext
+from worldmodel.t3vip import T3VIP
+
+PRETRAINED = Path(__file__).parent / "pretrained"
+WEIGHTS, CONFIG, TRAINING, STATE = "model.safetensors", "config.json", "training.safetensors", "state.json"
+KEEP = 2
+
+
+def write_folder(folder: Path, tensors: Mapping[str, Mapping[str, Tensor]], documents: Mapping[str, Any]) -> None:
+    """Write safetensors and JSON files as one folder, aside and renamed; an older folder of that name is replaced."""
+    aside = folder.with_name(folder.name + ".tmp")
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir(parents=True)
+    for name, group in tensors.items():
+        save_file({key: value.detach().cpu().contiguous() for key, value in group.items()}, aside / name)
+    for name, document in documents.items():
+        (aside / name).write_text(json.dumps(document, indent=2) + "\n")
+    for path in [*aside.iterdir(), aside]:
+        descriptor = os.open(path, os.O_RDONLY)
+        os.fsync(descriptor)
+        os.close(descriptor)
+    if folder.exists():
+        old = folder.with_name(folder.name + ".old")
+        shutil.rmtree(old, ignore_errors=True)
+        folder.rename(old)
+        aside.rename(folder)
+        shutil.rmtree(old)
+    else:
+        aside.rename(folder)
+
+
+def save_model(model: T3VIP, folder: Path, origin: Mapping[str, Any]) -> None:
+    """Save weights and config for `load_model`.
+
+    Args:
+        origin: where the model came from (options, seed, data hashes, scores), kept in the config for people.
+    """
+    document = {
+        "format": 1,
+        "kind": "t3vip",
+        "model": asdict(model.config),
+        "context": asdict(model.context),
+        "origin": dict(origin),
+    }
+    write_folder(folder, {WEIGHTS: model.state_dict()}, {CONFIG: document})
+
+
+def find_model(name: str | Path) -> Path:
+    """The folder of a model: a shipped name (`t3vip`), a training run, or a folder with config.json and weights.
+
+    Raises:
+        UsageError: nothing of that kind is there.
+    """
+    shipped = sorted(path.name for path in PRETRAINED.glob("*") if (path / WEIGHTS).exists())
+    for folder in (PRETRAINED / name, Path(name), Path(name) / "model", Path(name) / "model.old"):
+        if (folder / WEIGHTS).is_file() and (folder / CONFIG).is_file():
+            return folder
+    raise UsageError(
+        f"no model at '{name}'; give a training run, a folder with {CONFIG} and {WEIGHTS}, or a shipped name "
+        f"({', '.join(shipped) or 'none is shipped'})"
+    )
+
+
+def load_model(name: str | Path, device: str | torch.device = "cpu") -> T3VIP:
+    """Load a world model for use.
+
+    Args:
+        name: see `find_model`.
+        device: where it shall run.
+
+    Returns:
+        The model in evaluation mode.
+
+    Raises:
+        UsageError: it is not there or damaged.
+    """
+    folder = find_model(name)
+    try:
+        document = json.loads((folder / CONFIG).read_text())
+        config, context = dict(document["model"]), dict(document["context"])
+        model = T3VIP(ModelConfig(**config), ModelContext(**{k: _hashable(v) for k, v in context.items()}))
+        model.load_state_dict(load_file(folder / WEIGHTS))
+    except (SafetensorError, json.JSONDecodeError, KeyError, TypeError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise UsageError(
+            f"the model in {folder} cannot be read ({reason}); train it again or restore the folder"
+        ) from error
+    return model.to(device).to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+
+
+def _hashable(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def save_training(
+    run: Path, modules: Mapping[str, nn.Module], optimiser: torch.optim.Adam, state: dict[str, Any]
+) -> None:
+    """Write a checkpoint to go on from; only the newest two are kept."""
+    tensors = {
+        f"{prefix}.{key}": value for prefix, module in modules.items() for key, value in module.state_dict().items()
+    }
+    for name, parameter in _named_parameters(modules):
+        for key, value in optimiser.state.get(parameter, {}).items():
+            tensors[f"adam.{key}.{name}"] = torch.as_tensor(value)
+    write_folder(run / "checkpoints" / f"step-{state['step']:08d}", {TRAINING: tensors}, {STATE: state})
+    for old in _checkpoints(run)[:-KEEP]:
+        shutil.rmtree(old)
+
+
+def load_training(run: Path, modules: Mapping[str, nn.Module], optimiser: torch.optim.Adam) -> dict[str, Any] | None:
+    """Load the newest checkpoint into modules and optimiser.
+
+    Returns:
+        Its state, or None when the run has no checkpoint yet.
+    """
+    folders = _checkpoints(run)
+    if not folders:
+        return None
+    try:
+        tensors = load_file(folders[-1] / TRAINING)
+        state: dict[str, Any] = json.loads((folders[-1] / STATE).read_text())
+        for prefix, module in modules.items():
+            start = f"{prefix}."
+            module.load_state_dict({k[len(start) :]: v for k, v in tensors.items() if k.startswith(start)})
+    except (SafetensorError, json.JSONDecodeError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise UsageError(
+            f"the checkpoint {folders[-1]} does not fit ({reason}); remove it, or give another --out"
+        ) from error
+    for name, parameter in _named_parameters(modules):
+        moments = {
+            key: tensors[f"adam.{key}.{name}"]
+            for key in ("step", "exp_avg", "exp_avg_sq")
+            if f"adam.{key}.{name}" in tensors
+        }
+        if moments:
+            optimiser.state[parameter] = {
+                key: value.clone()
+                if key == "step"
+                else value.to(parameter.device).clone(memory_format=torch.preserve_format)
+                for key, value in moments.items()
+            }
+    return state
+
+
+def _named_parameters(modules: Mapping[str, nn.Module]) -> list[tuple[str, nn.Parameter]]:
+    return [(f"{prefix}.{n}", p) for prefix, module in modules.items() for n, p in module.named_parameters()]
+
+
+def _checkpoints(run: Path) -> list[Path]:
+    return sorted(
+        p for p in (run / "checkpoints").glob("step-*") if re.fullmatch(r"step-\d{8}", p.name) and (p / STATE).exists()
+    )

@@ -1,0 +1,137 @@
+"""Clips of a dataset held in memory: frames a gap apart with the actions between them added up, never dropped."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from data_collection.actions import aggregate_actions
+from data_collection.dataset import RGBDDataset
+from envs import ground_truth
+from envs.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Clips:
+    """A batch of clips."""
+
+    rgb: Tensor
+    """(B, T, 3, H, W) float32 in [0, 1]."""
+    depth: Tensor
+    """(B, T, 1, H, W) float32 metres."""
+    actions: Tensor
+    """(B, T-1, A) float32, aggregated over the frame gap, in the dataset's units."""
+
+    def to(self, device: torch.device) -> Clips:
+        """The same on another device."""
+        return Clips(*(getattr(self, field.name).to(device, non_blocking=True) for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class ClipTruth:
+    """What the simulator knows about a batch of clips; flow at index t leads from frame t to frame t+1."""
+
+    scene_flow: Tensor
+    """(B, T-1, 3, H, W) metres, camera frame."""
+    hand: Tensor
+    """(B, T-1, H, W) bool, pixels of the end-effector in frame t."""
+    tcp: Tensor
+    """(B, T, 3) metres, camera frame."""
+
+
+class ClipSource:
+    """Random clips of a dataset, the same for the same seed and step, with no state to save.
+
+    Args:
+        dataset: opened with the columns rgb, depth, action, and for truth segmentation, body_pose, proprio.
+        frame_gap: control steps from one frame of a clip to the next.
+        episodes: which episodes to use; all when None.
+        share: another source of the same dataset, whose memory this one uses too.
+    """
+
+    def __init__(
+        self, dataset: RGBDDataset, frame_gap: int, episodes: slice | None = None, share: ClipSource | None = None
+    ) -> None:
+        if frame_gap < 1:
+            raise UsageError(f"frame-gap is {frame_gap}; give 1 for adjacent frames, or more")
+        self.dataset, self.frame_gap = dataset, frame_gap
+        self._slices = dataset.episode_slices[episodes or slice(None)]
+        self._columns: dict[str, NDArray[Any]] = (
+            share._columns if share else {name: dataset.load(name) for name in ("rgb", "depth", "action")}
+        )
+
+    def starts(self, frames: int) -> NDArray[np.int64]:
+        """First rows of all clips of `frames` frames."""
+        span = (frames - 1) * self.frame_gap + 1
+        ranges = [np.arange(start, stop - span + 1) for start, stop in self._slices if stop - start >= span]
+        if not ranges:
+            longest = int(np.diff(self._slices, axis=1).max(initial=0))
+            raise UsageError(
+                f"no episode is {span} frames long, as {frames} frames at gap {self.frame_gap} need (the longest has "
+                f"{longest}); choose a smaller clip length or frame gap"
+            )
+        return np.concatenate(ranges)
+
+    def sample(self, rng: np.random.Generator, batch: int, frames: int) -> Clips:
+        """Draw a batch of clips uniformly over all places where one can start."""
+        return self.at(rng.choice(self.starts(frames), size=batch), frames)
+
+    def spread(self, count: int, frames: int) -> NDArray[np.int64]:
+        """First rows of `count` clips spread evenly over the data, for a fixed validation set."""
+        starts = self.starts(frames)
+        return starts[np.linspace(0, len(starts) - 1, min(count, len(starts))).astype(np.int64)]
+
+    def at(self, starts: NDArray[np.int64], frames: int) -> Clips:
+        """The clips that start at these rows."""
+        rows = self._rows(starts, frames)
+        rgb = torch.from_numpy(self._columns["rgb"][rows]).permute(0, 1, 4, 2, 3).float() / 255
+        depth = torch.from_numpy(self.dataset.depth_metres(self._columns["depth"][rows])).unsqueeze(2)
+        return Clips(rgb, depth, torch.from_numpy(self.actions_at(starts, frames)))
+
+    def actions_at(self, starts: NDArray[np.int64], frames: int) -> NDArray[np.float32]:
+        """(B, frames-1, A) aggregated actions of the clips that start at these rows."""
+        rows = self._rows(starts, frames)[:, :-1, None] + np.arange(self.frame_gap)
+        attrs = self.dataset.attrs
+        actions = aggregate_actions(self._columns["action"][rows], attrs["action_aggregation"], attrs["action_scale"])
+        return actions.astype(np.float32)
+
+    def truth_at(self, starts: NDArray[np.int64], frames: int) -> ClipTruth:
+        """Scene flow, hand pixels and TCP of the clips that start at these rows; needs a dataset with ground truth."""
+        dataset, camera = self.dataset, self.dataset.camera
+        for name in ("segmentation", "body_pose", "proprio"):
+            if name not in self._columns:
+                self._columns[name] = dataset.load(name)
+        rows = self._rows(starts, frames)
+        depth = dataset.depth_metres(self._columns["depth"][rows])
+        bodies = self._columns["segmentation"][rows]
+        poses = self._columns["body_pose"][rows]
+        flow = np.stack(
+            [
+                [
+                    ground_truth.scene_flow(camera, depth[b, t], bodies[b, t], poses[b, t], poses[b, t + 1])
+                    for t in range(frames - 1)
+                ]
+                for b in range(len(starts))
+            ]
+        )
+        hand = np.isin(bodies[:, :-1], dataset.attrs["hand_body_ids"])
+        tcp = camera.to_camera(self._columns["proprio"][rows][..., :3].astype(np.float64))
+        return ClipTruth(
+            torch.from_numpy(flow).permute(0, 1, 4, 2, 3).float(),
+            torch.from_numpy(hand),
+            torch.from_numpy(tcp).float(),
+        )
+
+    def action_statistics(self, samples: int = 4096) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Mean and standard deviation of aggregated actions, (A,) each; a dimension that never changes gets 1."""
+        actions = self.actions_at(self.spread(samples, 2), 2)[:, 0].astype(np.float64)
+        std = actions.std(0)
+        return actions.mean(0), np.where(std > 1e-3, std, 1.0)
+
+    def _rows(self, starts: NDArray[np.int64], frames: int) -> NDArray[np.int64]:
+        return np.asarray(starts)[:, None] + np.arange(frames) * self.frame_gap

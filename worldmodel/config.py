@@ -1,0 +1,65 @@
+"""What a world model is: the numbers that are stored beside its weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from envs.errors import UsageError
+from worldmodel.splatting import SplatMode
+
+LatentKind = Literal["none", "step", "clip"]
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Architecture of a T3VIP model; the defaults are the paper's."""
+
+    width: float = 1.0
+    """Multiplier on every channel count: 1.0 is the paper's network, 0.5 the CPU preset's."""
+    lstm_kernel: int = 5
+    """Kernel of the ConvLSTMs."""
+    masks: int = 10
+    """K, the number of masks; mask 0 is the background, which never moves."""
+    latents: LatentKind = "step"
+    """One latent a step, one a clip, or none (the deterministic T3VIP-D)."""
+    act_cond: bool = True
+    """Whether the model sees actions."""
+    splat: SplatMode = "softmax"
+    """How points that land on the same pixel share it; `softmax` lets the nearer one win."""
+    splat_sharpness: float = 15.0
+    """Of `softmax`, in 1/metre. Training rises to it from 0 (see TrainConfig.sharpen)."""
+    mask_head_std: float = 0.5
+    """Initial spread of the mask head's weights. Masks that start out alike never come apart."""
+
+    def __post_init__(self) -> None:
+        if self.width <= 0:
+            raise UsageError(f"width is {self.width}; give a positive multiplier such as 0.5 or 1.0")
+        if self.lstm_kernel < 1 or self.lstm_kernel % 2 == 0:
+            raise UsageError(f"lstm-kernel is {self.lstm_kernel}; give an odd number such as 3 or 5")
+        if self.masks < 2:
+            raise UsageError(f"masks is {self.masks}; give at least 2 (a background and one that moves)")
+        if self.splat_sharpness < 0:
+            raise UsageError(f"splat-sharpness is {self.splat_sharpness}; give 0 or more")
+
+
+@dataclass(frozen=True)
+class ModelContext:
+    """What a model was made for: it comes from the dataset and travels with the checkpoint."""
+
+    env_id: str
+    """Gymnasium id of the environment that the data came from."""
+    camera: str
+    """CameraModel as JSON."""
+    action_dim: int
+    frame_gap: int
+    """Control steps from one frame of the model to the next."""
+    control_rate: float
+    """Control steps a second."""
+    action_aggregation: tuple[str, ...]
+    """How each action dimension adds up over the frame gap."""
+    action_scale: tuple[float, ...]
+    """Metres or radians that one unit of each action dimension stands for."""
+    action_mean: tuple[float, ...]
+    action_std: tuple[float, ...]
+    """Statistics of aggregated training actions, for normalisation inside the model."""

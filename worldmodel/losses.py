@@ -1,0 +1,139 @@
+"""The terms of the full objective (paper, III-D to III-F), each a mean, so that weights hold at any picture size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from envs.errors import UsageError
+from worldmodel.compilation import compiled
+
+EDGE_SHARPNESS = 10.0
+"""How fast smoothness lets go at an edge of a picture in [0, 1]; with the paper's 1 an edge hardly counts."""
+_BEYOND_M = 1e4  # where the cloud ends: farther away than any true neighbour
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """lambda_1 to lambda_6 of the paper and its alpha."""
+
+    rgb: float = 0.4
+    """lambda_1, reconstruction of RGB in [0, 1]."""
+    depth: float = 0.02
+    """lambda_2, reconstruction of depth in metres."""
+    knn: float = 0.018
+    """lambda_3, alignment of the moved cloud with the next one, metres."""
+    scene_smoothness: float = 5e-4
+    """lambda_4, second differences of scene flow, metres."""
+    optical_smoothness: float = 5e-4
+    """lambda_5, second differences of optical flow, pixels."""
+    kl: float = 1e-3
+    """lambda_6, divergence of the latents from the prior, nats a pixel."""
+    power: Literal[1, 2] = 1
+    """alpha: 1 for absolute, 2 for squared reconstruction errors."""
+    knn_radius: int = 5
+    """The nearest neighbour is sought this many pixels to every side."""
+
+    def __post_init__(self) -> None:
+        for name in ("rgb", "depth", "knn", "scene_smoothness", "optical_smoothness", "kl"):
+            if getattr(self, name) < 0:
+                raise UsageError(
+                    f"the loss weight {name} is {getattr(self, name)}; give 0 to leave the term out, or more"
+                )
+        if self.knn_radius < 1:
+            raise UsageError(f"knn-radius is {self.knn_radius}; give at least 1 pixel")
+
+
+def reconstruction(predicted: Tensor, target: Tensor, power: int) -> Tensor:
+    """Mean absolute (power 1) or squared (power 2) error: Eq. (6)."""
+    difference = predicted - target
+    return difference.abs().mean() if power == 1 else difference.square().mean()
+
+
+@compiled
+def _scan_row(
+    query: Tensor, rows: Tensor, best: Tensor, where: Tensor, first: Tensor, window: int
+) -> tuple[Tensor, Tensor]:
+    """One row of the window: the running minimum over its `window` shifts."""
+    width = query.shape[-1]
+    for shift in range(window):
+        distance = (query - rows[..., shift : shift + width]).square().sum(1)
+        nearer = distance < best
+        best = torch.where(nearer, distance, best)
+        where = torch.where(nearer, first + shift, where)
+    return best, where
+
+
+def nearest_in_window(query: Tensor, reference: Tensor, radius: int) -> Tensor:
+    """The nearest reference point of each query point among the (2 radius + 1)^2 pixels around its own.
+
+    A running minimum over shifted views: it needs the memory of one distance a pixel, where `unfold` needs one a pixel
+    and shift.
+
+    Args:
+        query: (B, 3, H, W) metres.
+        reference: (B, 3, H, W) metres.
+        radius: in pixels.
+
+    Returns:
+        (B, H, W) int64, the flat index y * W + x of the nearest reference point.
+    """
+    window = 2 * radius + 1
+    batch, _, height, width = query.shape
+    with torch.no_grad():
+        query = query.detach().contiguous()
+        padded = torch.nn.functional.pad(reference.detach(), (radius,) * 4, value=_BEYOND_M)
+        best = query.new_full((batch, height, width), float("inf"))
+        where = torch.zeros((batch, height, width), dtype=torch.int32, device=query.device)
+        for row in range(window):
+            first = torch.tensor(row * window, dtype=torch.int32, device=query.device)
+            rows = padded[:, :, row : row + height].contiguous()
+            best, where = _scan_row(query, rows, best, where, first, window)
+        where = where.long()
+        y = torch.arange(height, device=query.device).view(-1, 1) + where // window - radius
+        x = torch.arange(width, device=query.device) + where % window - radius
+        return y * width + x
+
+
+def knn_distance(query: Tensor, reference: Tensor, radius: int) -> Tensor:
+    """Mean distance of each query point to its nearest reference point within the window, metres: Eqs. (9), (10)."""
+    index = nearest_in_window(query, reference, radius).flatten(1).unsqueeze(1).expand(-1, 3, -1)
+    neighbours = reference.flatten(2).gather(2, index)
+    return ((query.flatten(2) - neighbours).square().sum(1) + 1e-12).sqrt().mean()
+
+
+def knn_alignment(moved: Tensor, target: Tensor, radius: int) -> Tensor:
+    """Both directions of the point cloud alignment: Eq. (11), `(B, 3, H, W)` metres each."""
+    return knn_distance(moved, target, radius) + knn_distance(target, moved, radius)
+
+
+def edge_aware_smoothness(flow: Tensor, rgb: Tensor) -> Tensor:
+    """Mean second difference of a flow, let go at edges of the picture it starts from (section III-E).
+
+    Args:
+        flow: (B, C, H, W) metres or pixels.
+        rgb: (B, 3, H, W) in [0, 1].
+    """
+    total = flow.new_zeros(())
+    for axis in (-1, -2):
+        length = flow.shape[axis]
+        slope = flow.diff(dim=axis)
+        bend = slope.diff(dim=axis).abs().mean(1)
+        edge = rgb.diff(dim=axis).abs().mean(1)
+        edge = torch.maximum(edge.narrow(axis, 0, length - 2), edge.narrow(axis, 1, length - 2))
+        total = total + (bend * torch.exp(-EDGE_SHARPNESS * edge)).mean()
+    return total
+
+
+def kl_to_prior(mean: Tensor, log_variance: Tensor, pixels: int) -> Tensor:
+    """KL(N(mean, var) || N(0, I)), summed over a latent's dimensions, averaged over the rest, in nats a pixel: Eq. (7).
+
+    Args:
+        mean, log_variance: (..., Z, h, w).
+        pixels: of one frame.
+    """
+    divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance)
+    return divergence.sum((-3, -2, -1)).mean() / pixels

@@ -1,0 +1,145 @@
+"""Options of a training run, and the presets they start from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from envs.errors import UsageError
+from worldmodel.config import ModelConfig
+from worldmodel.losses import LossWeights
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """When what happens, as fractions of the run, so that a short run is a small copy of a long one."""
+
+    warmup: float = 0.02
+    """The learning rate rises to here."""
+    final_rate: float = 0.05
+    """The learning rate ends, after a cosine, at this share of its peak."""
+    truth_until: float = 0.6
+    """Scheduled sampling: the share of true inputs falls from 1 at the start to 0 here (half at half of this)."""
+    posterior_from: float = 0.25
+    """Before this, latents are drawn from the prior; from here on from the inference network."""
+    kl_ramp: tuple[float, float] = (0.5, 0.6)
+    """The KL weight rises from 0 to its value between these."""
+    sharpen: tuple[float, float] = (0.15, 0.4)
+    """The sharpness of softmax splatting rises from 0 to its value between these: sharp from the start, any motion
+    thickens the outline of what moves, and the model learns that nothing ever does."""
+    clip_lengths: tuple[tuple[float, int], ...] = ((0.3, 4), (0.6, 8), (1.0, 12))
+    """Until which fraction of the run clips have how many frames: short clips first, where a step is cheap."""
+
+    def __post_init__(self) -> None:
+        ends = [end for end, _ in self.clip_lengths]
+        if not ends or ends != sorted(ends) or ends[-1] != 1.0 or min(frames for _, frames in self.clip_lengths) < 3:
+            raise UsageError(
+                f"clip-lengths is {self.clip_lengths}; give pairs (fraction, frames) with rising fractions that end at "
+                "1.0 and at least 3 frames"
+            )
+
+    def clip_length(self, progress: float) -> int:
+        """Frames of a clip at this fraction of the run."""
+        return next(frames for end, frames in self.clip_lengths if progress <= end)
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Train a world model on a dataset of `collect-rollouts`. The same command again goes on where it was.
+
+    Options not given come from the preset: `tiny` (seconds; for trying things out), `cpu` (a model worth planning
+    with in under two hours on two cores), `paper` (full width, 200,000 steps; for a GPU).
+    """
+
+    data: Path
+    """Dataset to train on."""
+    out: Path
+    """Folder of the run: options, metrics, pictures, checkpoints, and the best model in `model/`."""
+    preset: Literal["tiny", "cpu", "paper"] = "cpu"
+    """Where the other options' values come from."""
+    validation: Path | None = None
+    """Dataset to validate on; by default the last tenth of the training episodes is held out."""
+    model: Literal["t3vip", "t3vip-d"] = "t3vip"
+    """t3vip-d is T3VIP without latents."""
+    architecture: ModelConfig = field(default_factory=ModelConfig)
+    """The network."""
+    losses: LossWeights = field(default_factory=LossWeights)
+    """The objective."""
+    schedule: Schedule = field(default_factory=Schedule)
+    """The curriculum."""
+    frame_gap: int = 3
+    """Control steps from one frame of a clip to the next; the actions between are added up."""
+    context: int = 2
+    """Frames that the model sees before it predicts."""
+    steps: int = 200_000
+    """Updates of the weights."""
+    batch: int = 16
+    """Clips a step."""
+    learning_rate: float = 1e-3
+    """Peak of Adam's learning rate."""
+    clip_gradient: float = 1.0
+    """Largest norm of the gradient."""
+    colour_jitter: float = 0.3
+    """How far each clip's colours are changed, lest the model cling to those of its scene; 0 for never."""
+    seed: int = 0
+    """Decides weights, clips and noise."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """What the network runs in; geometry, splatting and losses always run in float32."""
+    compile: bool = True
+    """Compile the network, where there is a compiler."""
+    device: str = "auto"
+    """`cpu`, `cuda`, or `auto` for a GPU where there is one."""
+    validate_every: int = 2000
+    """Steps from one validation, with pictures, to the next."""
+    validation_clips: int = 64
+    """Clips in the validation set."""
+    save_every: int = 500
+    """Steps from one checkpoint to the next."""
+    log_every: int = 50
+    """Steps from one line of metrics to the next."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "validate_every", "validation_clips", "save_every", "log_every", "frame_gap"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"{name.replace('_', '-')} is {getattr(self, name)}; give at least 1")
+        if self.learning_rate <= 0:
+            raise UsageError(f"learning-rate is {self.learning_rate}; give a positive number such as 1e-3")
+        shortest = min(frames for _, frames in self.schedule.clip_lengths)
+        if not 1 <= self.context < shortest:
+            raise UsageError(
+                f"context is {self.context}; give 1 to {shortest - 1}, fewer than the shortest clip's frames"
+            )
+
+
+_ANYWHERE = tyro.MISSING  # the command line must say
+
+PRESETS: dict[str, TrainOptions] = {
+    "paper": TrainOptions(_ANYWHERE, _ANYWHERE, "paper", precision="bfloat16"),
+    "cpu": TrainOptions(
+        _ANYWHERE,
+        _ANYWHERE,
+        "cpu",
+        architecture=ModelConfig(width=0.5, lstm_kernel=3),
+        steps=5000,
+        validate_every=500,
+        save_every=100,
+        precision="bfloat16",
+    ),
+    "tiny": TrainOptions(
+        _ANYWHERE,
+        _ANYWHERE,
+        "tiny",
+        architecture=ModelConfig(width=0.25, lstm_kernel=3, masks=4),
+        schedule=replace(Schedule(), clip_lengths=((1.0, 4),)),
+        steps=20,
+        batch=4,
+        validate_every=10,
+        validation_clips=4,
+        save_every=5,
+        log_every=1,
+        compile=False,
+    ),
+}

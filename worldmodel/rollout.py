@@ -1,0 +1,66 @@
+"""Unrolling a model over a clip, on true frames, on its own, or on a mixture of both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from worldmodel.clips import Clips
+from worldmodel.t3vip import T3VIP, Prediction
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Predictions of frames 1 .. T-1 of a clip and the frames they were made from."""
+
+    predictions: Sequence[Prediction]
+    input_rgb: Tensor
+    """(B, T-1, 3, H, W)."""
+
+    def stack(self, name: str) -> Tensor:
+        """One field of all predictions, (B, T-1, ...)."""
+        return torch.stack([getattr(prediction, name) for prediction in self.predictions], dim=1)
+
+
+def unroll(
+    model: T3VIP,
+    clips: Clips,
+    context: int,
+    latents: Tensor | None = None,
+    truth: float = 0.0,
+    generator: torch.Generator | None = None,
+    still: bool = False,
+) -> Rollout:
+    """Predict every next frame of a clip.
+
+    Args:
+        model: the world model.
+        clips: the clip, T frames; with `truth` 0 only its first `context` frames and its actions are looked at.
+        context: frames that are always true.
+        latents: (B, T-1, Z, H/8, W/8), or None for zeros.
+        truth: probability that a later input is the true frame instead of the predicted one (scheduled sampling).
+        generator: draws which.
+        still: render as if every transform were the identity.
+    """
+    rgb, depth = clips.rgb[:, 0], clips.depth[:, 0]
+    memory = model.blank_memory(rgb)
+    predictions: list[Prediction] = []
+    inputs = []
+    for t in range(clips.actions.shape[1]):
+        inputs.append(rgb)
+        latent = None if latents is None else latents[:, t]
+        prediction, memory = model.predict(rgb, depth, clips.actions[:, t], latent, memory, still=still)
+        predictions.append(prediction)
+        if t + 1 < context or truth >= 1:
+            rgb, depth = clips.rgb[:, t + 1], clips.depth[:, t + 1]
+        elif truth <= 0:
+            rgb, depth = prediction.rgb, prediction.depth
+        else:
+            chance = torch.rand((rgb.shape[0], 1, 1, 1), generator=generator)
+            true = (chance < truth).to(rgb.device)
+            rgb = torch.where(true, clips.rgb[:, t + 1], prediction.rgb)
+            depth = torch.where(true, clips.depth[:, t + 1], prediction.depth)
+    return Rollout(predictions, torch.stack(inputs, dim=1))

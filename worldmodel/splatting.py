@@ -1,0 +1,92 @@
+"""Differentiable forward warping: every pixel of a picture is thrown to where its flow sends it.
+
+Bilinear splatting is the transpose of bilinear sampling. PyTorch has the transpose already, as the gradient of
+`grid_sample` with respect to its input, natively on every device; here it becomes an operator with gradients of its
+own, which are again one `grid_sample` and one of its gradients. Nothing is materialised per corner.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+SplatMode = Literal["average", "softmax", "sum"]
+MIN_COVERAGE = 0.5
+"""A pixel on which less than half a pixel's worth of source points lands counts as disoccluded."""
+
+_FAR_OUTSIDE = 4.0  # in normalised coordinates, where the picture is [-1, 1]: dropped by zero padding
+_BILINEAR, _ZEROS, _ALIGN_CORNERS = 0, 0, True
+
+
+def _scatter(values: Tensor, grid: Tensor) -> Tensor:
+    out, _ = torch.ops.aten.grid_sampler_2d_backward(
+        values, torch.zeros_like(values), grid, _BILINEAR, _ZEROS, _ALIGN_CORNERS, (True, False)
+    )
+    return out
+
+
+class _BilinearSplat(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, grid: Tensor) -> Tensor:
+        ctx.save_for_backward(values, grid)
+        return _scatter(values, grid)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
+        values, grid = ctx.saved_tensors
+        (gradient,) = gradients
+        gradient = gradient.contiguous()
+        sampled = torch.grid_sampler_2d(gradient, grid, _BILINEAR, _ZEROS, _ALIGN_CORNERS)
+        _, grid_gradient = torch.ops.aten.grid_sampler_2d_backward(
+            values, gradient, grid, _BILINEAR, _ZEROS, _ALIGN_CORNERS, (False, True)
+        )
+        return sampled, grid_gradient
+
+
+def splat_sum(values: Tensor, pixels: Tensor) -> Tensor:
+    """Throw each value to a place of the picture, shared bilinearly among the four pixels around it, and add up.
+
+    What lands outside the picture is lost.
+
+    Args:
+        values: (B, C, H, W).
+        pixels: (B, 2, H, W), where each one goes, (u, v) in pixels; finite.
+
+    Returns:
+        (B, C, H, W), differentiable in both arguments.
+    """
+    height, width = values.shape[-2:]
+    scale = pixels.new_tensor([2.0 / max(width - 1, 1), 2.0 / max(height - 1, 1)]).view(2, 1, 1)
+    grid = (pixels * scale - 1.0).clamp(-_FAR_OUTSIDE, _FAR_OUTSIDE).permute(0, 2, 3, 1).contiguous()
+    return _BilinearSplat.apply(values.contiguous(), grid)
+
+
+def splat(
+    values: Tensor, pixels: Tensor, depth: Tensor, mode: SplatMode = "average", sharpness: float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """Forward-warp a picture (softmax splatting, Niklaus and Liu 2020), points behind the camera dropped.
+
+    Args:
+        values: (B, C, H, W).
+        pixels: (B, 2, H, W), target places in pixels.
+        depth: (B, 1, H, W), depth of the moved points in metres: nearer ones win in mode `softmax`.
+        mode: `average` shares a pixel among all that land on it, `softmax` weights them by exp(-sharpness * depth),
+            `sum` adds them up.
+        sharpness: in 1/metre, for `softmax`; 0 is `average`.
+
+    Returns:
+        The warped picture (B, C, H, W), 0 where nothing lands, and the coverage (B, 1, H, W): how many source points
+        land on each pixel, before any weighting by depth.
+    """
+    in_front = (depth > 1e-3).to(values.dtype)
+    weights = in_front
+    if mode == "softmax" and sharpness > 0:
+        # Shifting by the mean leaves the result as it is and keeps the exponential within range.
+        weights = in_front * torch.exp((sharpness * (depth.mean((1, 2, 3), keepdim=True) - depth)).clamp(-30, 30))
+    landed = splat_sum(torch.cat((values * weights, weights, in_front), dim=1), pixels)
+    picture, total, coverage = landed.split((values.shape[1], 1, 1), dim=1)
+    if mode == "sum":
+        return picture, coverage
+    return picture / total.clamp(min=1e-12), coverage

@@ -1,0 +1,146 @@
+"""Command `train-worldmodel`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+import torch
+
+from data_collection.dataset import RGBDDataset
+from envs import command as command_line
+from envs.errors import UsageError
+from worldmodel.clips import ClipSource
+from worldmodel.config import ModelContext
+from worldmodel.options import PRESETS, TrainOptions
+from worldmodel.t3vip import T3VIP
+from worldmodel.trainer import Trainer
+from worldmodel.validation import ValidationSet
+
+TEST_ONLY = "t3vip/TabletopD-v0"
+"""The unseen scene; training or tuning on it would make every figure about generalisation worthless."""
+HELD_OUT = 10
+"""Without a validation set, one episode in so many is held out."""
+
+
+def main(options: TrainOptions) -> None:
+    """Train."""
+    train, validation = _open(options)
+    context = _context(train, options)
+    if options.model == "t3vip-d":
+        options = replace(options, architecture=replace(options.architecture, latents="none"))
+    _claim(options)
+    torch.manual_seed(options.seed)
+    device = _device(options.device)
+    model = T3VIP(options.architecture, context).to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    origin = {
+        "options": _document(options),
+        "data": {"train": train.dataset.content_hash, "validation": validation.source.dataset.content_hash},
+        "versions": {"torch": torch.__version__},
+    }
+    Trainer(model, options, train, validation, origin).run()
+
+
+def _open(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
+    dataset = RGBDDataset(options.data)
+    for opened in [dataset] + ([RGBDDataset(options.validation)] if options.validation else []):
+        if opened.attrs["env_id"] == TEST_ONLY:
+            raise UsageError(
+                f"{opened.path} comes from {TEST_ONLY}, the test scene; train and validate on scene A, B or C"
+            )
+    if options.validation is not None:
+        held_out = RGBDDataset(options.validation)
+        _same_world(dataset, held_out)
+        train, other = ClipSource(dataset, options.frame_gap), ClipSource(held_out, options.frame_gap)
+    else:
+        if dataset.episodes < 2:
+            raise UsageError(
+                f"{dataset.path} has {dataset.episodes} episode, none to hold out; collect more, or give --validation"
+            )
+        split = dataset.episodes - max(1, dataset.episodes // HELD_OUT)
+        train = ClipSource(dataset, options.frame_gap, slice(0, split))
+        other = ClipSource(dataset, options.frame_gap, slice(split, None), share=train)
+    frames = max(frames for _, frames in options.schedule.clip_lengths)
+    return train, ValidationSet(other, options.validation_clips, frames, options.context, options.batch)
+
+
+def _same_world(train: RGBDDataset, other: RGBDDataset) -> None:
+    for name, ours, theirs in (
+        ("action size", train.action_dim, other.action_dim),
+        ("image size", (train.camera.height, train.camera.width), (other.camera.height, other.camera.width)),
+        ("depth range", (train.camera.near, train.camera.far), (other.camera.near, other.camera.far)),
+    ):
+        if ours != theirs:
+            raise UsageError(f"{other.path} has {name} {theirs}, {train.path} has {ours}; validate on data of one kind")
+
+
+def _context(train: ClipSource, options: TrainOptions) -> ModelContext:
+    attrs = train.dataset.attrs
+    mean, std = train.action_statistics()
+    return ModelContext(
+        env_id=attrs["env_id"],
+        camera=train.dataset.camera.to_json(),
+        action_dim=train.dataset.action_dim,
+        frame_gap=options.frame_gap,
+        control_rate=float(attrs["control_rate"]),
+        action_aggregation=tuple(attrs["action_aggregation"]),
+        action_scale=tuple(float(x) for x in attrs["action_scale"]),
+        action_mean=tuple(float(x) for x in mean),
+        action_std=tuple(float(x) for x in std),
+    )
+
+
+def _claim(options: TrainOptions) -> None:
+    """Write the options beside the run, or check that the run there is this one."""
+    path = options.out / "config.json"
+    document = _document(options)
+    if path.exists():
+        before = json.loads(path.read_text())
+        for name in document:
+            if name != "device" and before.get(name) != document[name]:
+                raise UsageError(
+                    f"{options.out} holds a run with {name} = {before.get(name)}, not {document[name]}; give the same "
+                    "options to go on with it, or another --out"
+                )
+        return
+    options.out.mkdir(parents=True, exist_ok=True)
+    aside = path.with_suffix(".tmp")
+    aside.write_text(json.dumps(document, indent=2) + "\n")
+    aside.replace(path)
+
+
+def _document(options: TrainOptions) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads(json.dumps(asdict(options), default=str))
+    document.pop("out")
+    return document
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        return torch.empty(0, device=name).device
+    except (RuntimeError, AssertionError) as error:
+        raise UsageError(
+            f"device '{name}' is not to be had here ({str(error).splitlines()[0]}); give cpu or cuda"
+        ) from error
+
+
+def _preset(arguments: Sequence[str]) -> TrainOptions:
+    """The preset that the command line names, whose values are the defaults of the rest."""
+    name = "cpu"
+    for here, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        if here == "--preset":
+            name = following
+        elif here.startswith("--preset="):
+            name = here.split("=", 1)[1]
+    if name not in PRESETS:
+        raise UsageError(f"no preset '{name}'; there are {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+def command() -> None:
+    """Entry point of `train-worldmodel`."""
+    command_line.run(TrainOptions, main, default=_preset)

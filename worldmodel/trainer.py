@@ -1,0 +1,274 @@
+"""The training loop: questions of when, and what is done then."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from envs.errors import UsageError
+from worldmodel import losses
+from worldmodel.checkpoint import load_training, save_model, save_training
+from worldmodel.clips import Clips, ClipSource
+from worldmodel.compilation import can_compile
+from worldmodel.inference import InferenceNetwork
+from worldmodel.options import TrainOptions
+from worldmodel.pictures import picture_prediction
+from worldmodel.rollout import Rollout, unroll
+from worldmodel.t3vip import T3VIP
+from worldmodel.validation import ValidationSet, summary, validate
+
+logger = logging.getLogger(__name__)
+MAX_BAD_STEPS = 10
+
+
+class Trainer:
+    """Trains one model; exact resume from its run's folder.
+
+    Args:
+        model: on its device.
+        options: of the run; `options.out` holds everything that is written.
+        train: clips to learn from.
+        validation: clips to score on.
+        origin: what `save_model` keeps about where the model came from.
+    """
+
+    def __init__(
+        self, model: T3VIP, options: TrainOptions, train: ClipSource, validation: ValidationSet, origin: dict[str, Any]
+    ) -> None:
+        self.model, self.options, self.train_clips, self.validation = model, options, train, validation
+        self.origin = origin
+        self.device = model.device
+        self.modules: dict[str, torch.nn.Module] = {"model": model}
+        self.inference: InferenceNetwork | None = None
+        if model.latent_channels:
+            per_clip = model.config.latents == "clip"
+            self.inference = InferenceNetwork(4, model.latent_channels, model.config.width, per_clip).to(self.device)
+            self.modules["inference"] = self.inference
+        parameters = [p for module in self.modules.values() for p in module.parameters()]
+        self.parameters = parameters
+        self.optimiser = torch.optim.Adam(parameters, lr=options.learning_rate)
+        self.step, self.best, self.seconds = 0, -math.inf, 0.0
+        self.bad_steps = 0
+        if options.compile and can_compile():
+            model.fast_network = torch.compile(model.network, dynamic=False)
+
+    def run(self) -> None:
+        """Train to the last step, resuming where the run's folder stands; SIGTERM saves and stops."""
+        options = self.options
+        state = load_training(options.out, self.modules, self.optimiser)
+        if state is not None:
+            self.step, self.best, self.seconds = state["step"], state["best"], state["seconds"]
+        writer = SummaryWriter(str(options.out / "tensorboard"), purge_step=self.step)
+        started = time.monotonic()
+        base_seconds = self.seconds
+        waited = 0.0
+        terms: dict[str, float] = {}
+        bar = tqdm(total=options.steps, initial=self.step, desc="train", unit="step", dynamic_ncols=True)
+        with _stop_on_sigterm() as stopping:
+            while self.step < options.steps:
+                self.model.train()
+                asked = time.monotonic()
+                clips = self._next_clips()
+                waited += time.monotonic() - asked
+                terms = self.update(clips)
+                self.step += 1
+                self.seconds = base_seconds + time.monotonic() - started
+                bar.update()
+                bar.set_postfix({k: f"{v:.4f}" for k, v in terms.items() if k in ("loss", "rgb", "depth", "knn")})
+                last = self.step == options.steps
+                if self.step % options.log_every == 0 or last:
+                    share = waited / max(time.monotonic() - started, 1e-9)
+                    self._log(writer, "train", terms | {"seconds": self.seconds, "data_wait": share})
+                if self.step % options.validate_every == 0 or last:
+                    self._validate(writer, bar)
+                if self.step % options.save_every == 0 or last or stopping():
+                    self._save()
+                if stopping():
+                    bar.write(f"stopped at step {self.step}; the same command goes on from here")
+                    break
+        bar.close()
+        writer.close()
+
+    def update(self, clips: Clips) -> dict[str, float]:
+        """One step of Adam on a batch of clips; returns the terms of the loss.
+
+        A loss that is not finite skips the step; several in a row end the run.
+        """
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.learning_rate
+        total, terms = self.objective(clips)
+        bad = [name for name, value in terms.items() if not math.isfinite(value)]
+        if bad:
+            self.bad_steps += 1
+            logger.warning("step %d skipped: %s not finite", self.step, ", ".join(bad))
+            if self.bad_steps >= MAX_BAD_STEPS:
+                raise UsageError(
+                    f"the loss was not finite {MAX_BAD_STEPS} steps in a row (terms: {', '.join(bad)}); look for bad "
+                    "frames with inspect-dataset, or lower --learning-rate"
+                )
+            return terms
+        self.bad_steps = 0
+        self.optimiser.zero_grad(set_to_none=True)
+        total.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.options.clip_gradient)
+        if torch.isfinite(norm):
+            self.optimiser.step()
+        else:
+            logger.warning("step %d skipped: gradient not finite", self.step)
+        return terms
+
+    def objective(self, clips: Clips) -> tuple[Tensor, dict[str, float]]:
+        """The full objective (paper, section III-F) on a batch, and its unweighted terms."""
+        options, weights = self.options, self.options.losses
+        noise = torch.Generator().manual_seed(_mix(options.seed, self.step))
+        schedule = options.schedule
+        low, high = schedule.sharpen
+        self.model.splat_sharpness = self.model.config.splat_sharpness * _ramp(self.progress, low, high)
+        truth = 1 - _ramp(self.progress, 0.0, schedule.truth_until)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=options.precision == "bfloat16"):
+            latents, kl = self._latents(clips, noise)
+            rollout = unroll(self.model, clips, options.context, latents, truth, noise)
+        terms = reconstruction_terms(self.model, rollout, clips, weights)
+        if kl is not None:
+            terms["kl"] = kl
+        scale = {**asdict(weights), "kl": weights.kl * _ramp(self.progress, *schedule.kl_ramp)}
+        total = torch.stack([scale[name] * value for name, value in terms.items()]).sum()
+        return total, {"loss": float(total), **{name: float(value) for name, value in terms.items()}}
+
+    @property
+    def progress(self) -> float:
+        """Fraction of the run that is done."""
+        return self.step / self.options.steps
+
+    @property
+    def learning_rate(self) -> float:
+        """Warm-up, then a cosine."""
+        schedule = self.options.schedule
+        rise = _ramp((self.step + 1) / self.options.steps, 0.0, schedule.warmup)
+        fall = 0.5 * (1 + math.cos(math.pi * _ramp(self.progress, schedule.warmup, 1.0)))
+        return self.options.learning_rate * rise * (schedule.final_rate + (1 - schedule.final_rate) * fall)
+
+    def _next_clips(self) -> Clips:
+        rng = np.random.default_rng((self.options.seed, self.step))
+        frames = self.options.schedule.clip_length(self.progress)
+        clips = self.train_clips.sample(rng, self.options.batch, frames)
+        return jitter_colours(clips, self.options.colour_jitter, rng).to(self.device)
+
+    def _latents(self, clips: Clips, noise: torch.Generator) -> tuple[Tensor | None, Tensor | None]:
+        if self.inference is None:
+            return None, None
+        batch, steps = clips.actions.shape[:2]
+        per_clip = self.model.config.latents == "clip"
+        draws = torch.randn((batch, 1 if per_clip else steps, *self.model.latent_shape), generator=noise)
+        draws = draws.expand(-1, steps, -1, -1, -1).to(self.device)
+        if self.progress < self.options.schedule.posterior_from:
+            return draws, None
+        near, far = self.model.camera.near, self.model.camera.far
+        frames = torch.cat((clips.rgb, (clips.depth - near) / (far - near)), dim=2)
+        mean, log_variance = self.inference(frames)
+        pixels = self.model.camera.height * self.model.camera.width
+        return mean + (0.5 * log_variance).exp() * draws, losses.kl_to_prior(mean, log_variance, pixels)
+
+    def _validate(self, writer: SummaryWriter, bar: tqdm[Any]) -> None:
+        scores = validate(self.model, self.validation)
+        self._log(writer, "validation", scores)
+        bar.write(f"step {self.step}: {summary(scores)}")
+        clips, starts = next(self.validation.batches())
+        truth = None
+        if self.validation.source.dataset.has_ground_truth:
+            truth = self.validation.source.truth_at(starts[:1], self.validation.frames)
+        picture = self.options.out / "pictures" / f"step-{self.step:08d}.png"
+        picture_prediction(self.model, clips, truth, self.options.context, picture)
+        # Only from where splatting has its final sharpness are two scores of one run scores of the same program.
+        if self.progress >= self.options.schedule.sharpen[1] or self.step == self.options.steps:
+            score = float(scores["score"])  # type: ignore[arg-type]
+            if score >= self.best:
+                self.best = score
+                origin = self.origin | {"step": self.step, "seconds": round(self.seconds), "validation": scores}
+                save_model(self.model, self.options.out / "model", origin)
+
+    def _save(self) -> None:
+        state = {"step": self.step, "best": self.best, "seconds": self.seconds}
+        save_training(self.options.out, self.modules, self.optimiser, state)
+
+    def _log(self, writer: SummaryWriter, kind: str, values: dict[str, Any]) -> None:
+        with (self.options.out / "metrics.jsonl").open("a") as file:
+            file.write(json.dumps({"kind": kind, "step": self.step, **values}) + "\n")
+        for name, value in values.items():
+            numbers = value if isinstance(value, list) else [value]
+            writer.add_scalar(f"{kind}/{name}", numbers[-1], self.step)
+
+
+def reconstruction_terms(
+    model: T3VIP, rollout: Rollout, clips: Clips, weights: losses.LossWeights
+) -> dict[str, Tensor]:
+    """All terms but the KL, over all predictions of a rollout at once; a term of weight 0 is left out."""
+    terms: dict[str, Tensor] = {}
+    if weights.rgb:
+        terms["rgb"] = losses.reconstruction(rollout.stack("rgb"), clips.rgb[:, 1:], weights.power)
+    if weights.depth:
+        terms["depth"] = losses.reconstruction(rollout.stack("depth"), clips.depth[:, 1:], weights.power)
+    if weights.knn:
+        target = clips.depth[:, 1:] * model.rays
+        moved = rollout.stack("moved_points")
+        terms["knn"] = losses.knn_alignment(moved.flatten(0, 1), target.flatten(0, 1), weights.knn_radius)
+    pictures = rollout.input_rgb.detach().flatten(0, 1)
+    if weights.scene_smoothness:
+        flow = rollout.stack("scene_flow").flatten(0, 1)
+        terms["scene_smoothness"] = losses.edge_aware_smoothness(flow, pictures)
+    if weights.optical_smoothness:
+        flow = rollout.stack("optical_flow").flatten(0, 1)
+        terms["optical_smoothness"] = losses.edge_aware_smoothness(flow, pictures)
+    return terms
+
+
+def jitter_colours(clips: Clips, strength: float, rng: np.random.Generator) -> Clips:
+    """Change each clip's colours as a whole: order of the channels, gain, offset and gamma; depth stays."""
+    if strength <= 0:
+        return clips
+    batch = clips.rgb.shape[0]
+    order = torch.from_numpy(np.stack([rng.permutation(3) for _ in range(batch)]))
+    picture = torch.gather(clips.rgb, 2, order.view(batch, 1, 3, 1, 1).expand_as(clips.rgb))
+
+    def draw(channels: int) -> Tensor:
+        return torch.from_numpy(rng.uniform(-strength, strength, (batch, 1, channels, 1, 1))).float()
+
+    picture = picture.clamp(min=1e-4) ** torch.exp(draw(1)) * (1 + draw(3)) + 0.5 * draw(1)
+    return Clips(picture.clamp(0, 1), clips.depth, clips.actions)
+
+
+def _ramp(x: float, low: float, high: float) -> float:
+    """0 until low, 1 from high, linear between."""
+    return min(max((x - low) / max(high - low, 1e-9), 0.0), 1.0)
+
+
+def _mix(seed: int, step: int) -> int:
+    return int(np.random.SeedSequence((seed, step, 1)).generate_state(1, np.uint64)[0] >> 1)
+
+
+@contextmanager
+def _stop_on_sigterm() -> Iterator[Any]:
+    """Yields a question: has somebody asked us to stop?"""
+    asked: list[int] = []
+    try:
+        before = signal.signal(signal.SIGTERM, lambda number, frame: asked.append(number))
+    except ValueError:  # not in the main thread: nobody can signal us
+        yield lambda: False
+        return
+    try:
+        yield lambda: bool(asked)
+    finally:
+        signal.signal(signal.SIGTERM, before)

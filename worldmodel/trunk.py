@@ -1,0 +1,99 @@
+"""CDNA's trunk, shared by all models: an encoder to the motion embedding and decoders back to pictures."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from worldmodel.blocks import ConvLSTM, LSTMState, layer_norm
+
+STRIDE = 8
+"""The motion embedding is this much smaller than the picture."""
+
+
+def scaled(channels: int, width: float) -> int:
+    """A layer's channels under the width multiplier, a multiple of 8."""
+    return max(8, round(channels * width / 8) * 8)
+
+
+class Encoder(nn.Module):
+    """Frame, action and latent to the motion embedding (Finn et al. 2016, with T3VIP's channel counts).
+
+    conv 5x5/2 -> 32; ConvLSTM 32, 32; conv 3x3/2 -> 64; ConvLSTM 64, 64; conv 3x3/2 -> 128; the action and the latent
+    are tiled and joined by a 1x1 conv; ConvLSTM 128. A layer norm follows the first convolution and every LSTM.
+    """
+
+    def __init__(self, inputs: int, action_dim: int, latent_channels: int, width: float, lstm_kernel: int) -> None:
+        super().__init__()
+        small, middle, large = (scaled(c, width) for c in (32, 64, 128))
+        self.channels = (small, middle, large)
+        self.conv0 = nn.Conv2d(inputs, small, 5, stride=2, padding=2)
+        self.norm0 = layer_norm(small)
+        self.lstm1 = ConvLSTM(small, small, lstm_kernel)
+        self.lstm2 = ConvLSTM(small, small, lstm_kernel)
+        self.conv1 = nn.Conv2d(small, middle, 3, stride=2, padding=1)
+        self.lstm3 = ConvLSTM(middle, middle, lstm_kernel)
+        self.lstm4 = ConvLSTM(middle, middle, lstm_kernel)
+        self.conv2 = nn.Conv2d(middle, large, 3, stride=2, padding=1)
+        self.join = nn.Conv2d(large + action_dim + latent_channels, large, 1)
+        self.lstm5 = ConvLSTM(large, large, lstm_kernel)
+        self.norm1, self.norm2 = layer_norm(small), layer_norm(small)
+        self.norm3, self.norm4 = layer_norm(middle), layer_norm(middle)
+        self.norm5 = layer_norm(large)
+
+    def forward(
+        self, frame: Tensor, action: Tensor, latent: Tensor | None, states: list[LSTMState]
+    ) -> tuple[Tensor, tuple[Tensor, Tensor], list[LSTMState]]:
+        """Encode one frame.
+
+        Args:
+            frame: (B, inputs, H, W), H and W multiples of 8.
+            action: (B, A), normalised; A may be 0.
+            latent: (B, Z, H/8, W/8) or None for a model without latents.
+            states: of the five LSTMs.
+
+        Returns:
+            The motion embedding (B, 128w, H/8, W/8), the skips at 1/2 and 1/4 of the size, the new states.
+        """
+        skip0 = self.norm0(F.relu(self.conv0(frame)))
+        x, state1 = self.lstm1(skip0, states[0])
+        x, state2 = self.lstm2(self.norm1(x), states[1])
+        skip1 = F.relu(self.conv1(self.norm2(x)))
+        x, state3 = self.lstm3(skip1, states[2])
+        x, state4 = self.lstm4(self.norm3(x), states[3])
+        x = F.relu(self.conv2(self.norm4(x)))
+        tiled = action[:, :, None, None].to(x.dtype).expand(-1, -1, *x.shape[2:])
+        joined = [x, tiled] if latent is None else [x, tiled, latent.to(x.dtype)]
+        x = F.relu(self.join(torch.cat(joined, dim=1)))
+        x, state5 = self.lstm5(x, states[4])
+        return self.norm5(x), (skip0, skip1), [state1, state2, state3, state4, state5]
+
+
+class Decoder(nn.Module):
+    """Motion embedding back to a picture: deconv, ConvLSTM 64, skip, deconv, ConvLSTM 32, skip, deconv, 1x1 conv."""
+
+    def __init__(self, outputs: int, width: float, lstm_kernel: int) -> None:
+        super().__init__()
+        small, middle, large = (scaled(c, width) for c in (32, 64, 128))
+        self.up1 = nn.ConvTranspose2d(large, middle, 4, stride=2, padding=1)
+        self.lstm6 = ConvLSTM(middle, middle, lstm_kernel)
+        self.norm6 = layer_norm(middle)
+        self.up2 = nn.ConvTranspose2d(2 * middle, small, 4, stride=2, padding=1)
+        self.lstm7 = ConvLSTM(small, small, lstm_kernel)
+        self.norm7 = layer_norm(small)
+        self.up3 = nn.ConvTranspose2d(2 * small, small, 4, stride=2, padding=1)
+        self.norm8 = layer_norm(small)
+        self.head = nn.Conv2d(small, outputs, 1)
+
+    def forward(
+        self, embedding: Tensor, skips: tuple[Tensor, Tensor], states: list[LSTMState]
+    ) -> tuple[Tensor, list[LSTMState]]:
+        """Decode to `(B, outputs, H, W)`, no activation; `states` are those of the two LSTMs."""
+        skip0, skip1 = skips
+        x, state6 = self.lstm6(F.relu(self.up1(embedding)), states[0])
+        x = torch.cat((self.norm6(x), skip1), dim=1)
+        x, state7 = self.lstm7(F.relu(self.up2(x)), states[1])
+        x = torch.cat((self.norm7(x), skip0), dim=1)
+        x = self.norm8(F.relu(self.up3(x)))
+        return self.head(x), [state6, state7]

@@ -1,0 +1,137 @@
+"""How good a model is on clips that it was not trained on, beside copying the last frame it saw."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from worldmodel.clips import Clips, ClipSource, ClipTruth
+from worldmodel.metrics import flow_scores, psnr_per_step, rmse_per_step
+from worldmodel.rollout import Rollout, unroll
+from worldmodel.t3vip import T3VIP
+from worldmodel.tracking import HandTrack
+
+Scores = dict[str, float | list[float]]
+MIN_WAY_M = 0.03
+"""Clips in which the hand goes less than this far do not count for the tracking error."""
+
+
+@dataclass(frozen=True)
+class ValidationSet:
+    """A fixed set of held-out clips.
+
+    Args:
+        source: where they come from.
+        clips: how many, spread evenly over the data.
+        frames: of each clip, context included.
+        context: how many frames the model sees.
+    """
+
+    source: ClipSource
+    clips: int = 64
+    frames: int = 12
+    context: int = 2
+    batch: int = 16
+
+    def batches(self) -> Iterator[tuple[Clips, NDArray[np.int64]]]:
+        """The clips in batches, with their first rows."""
+        starts = self.source.spread(self.clips, self.frames)
+        for first in range(0, len(starts), self.batch):
+            chosen = starts[first : first + self.batch]
+            yield self.source.at(chosen, self.frames), chosen
+
+
+@torch.inference_mode()
+def validate(model: T3VIP, data: ValidationSet, still: bool = False) -> Scores:
+    """Score free-running prediction with latents at 0, and motion where the dataset knows it.
+
+    Args:
+        model: any world model; left in the mode it was in.
+        data: the held-out clips.
+        still: pretend that every transform is the identity; the scores must then be those of copying.
+
+    Returns:
+        Per predicted step after the context: `psnr`, `copy_psnr` (dB), `depth_rmse`, `copy_depth_rmse` (metres).
+        Means: `inpainted` (share of pixels), `score` (RGB PSNR plus depth PSNR in dB, the paper's tuning metric). With
+        ground truth also the terms of `flow_scores`, one step ahead of true frames, and `tracking_error`: how far the
+        moved TCP is off at the end of the clip, over how far it really went.
+    """
+    was_training = model.training
+    model.eval()
+    device = model.device
+    predicted_rgb, predicted_depth, rgb, depth, inpainted = [], [], [], [], []
+    flows: list[tuple[Tensor, Tensor, Tensor]] = []
+    tracked: list[tuple[Tensor, Tensor]] = []
+    c = data.context
+    for clips, starts in data.batches():
+        clips = clips.to(device)
+        free = unroll(model, clips, c, still=still)
+        predicted_rgb.append(free.stack("rgb")[:, c - 1 :].cpu())
+        predicted_depth.append(free.stack("depth")[:, c - 1 :].cpu())
+        rgb.append(clips.rgb[:, c - 1 :].cpu())
+        depth.append(clips.depth[:, c - 1 :].cpu())
+        inpainted.append(free.stack("occlusion")[:, c - 1 :].mean().cpu())
+        if data.source.dataset.has_ground_truth:
+            truth = data.source.truth_at(starts, data.frames)
+            taught = unroll(model, clips, c, truth=1.0, still=still)
+            flow = taught.stack("scene_flow")[:, c - 1 :].cpu()
+            flows.append((flow, truth.scene_flow[:, c - 1 :], truth.hand[:, c - 1 :]))
+            tracked.append(_track(model, clips, truth, free, c))
+    model.train(was_training)
+    all_rgb, all_depth = torch.cat(rgb), torch.cat(depth)
+    camera = model.camera
+    depth_rmse = rmse_per_step(torch.cat(predicted_depth), all_depth[:, 1:])
+    psnr = psnr_per_step(torch.cat(predicted_rgb), all_rgb[:, 1:])
+    depth_psnr = 20 * torch.log10((camera.far - camera.near) / depth_rmse.clamp(min=1e-9))
+    scores: Scores = {
+        "psnr": psnr.tolist(),
+        "copy_psnr": psnr_per_step(all_rgb[:, :1].expand_as(all_rgb[:, 1:]), all_rgb[:, 1:]).tolist(),
+        "depth_rmse": depth_rmse.tolist(),
+        "copy_depth_rmse": rmse_per_step(all_depth[:, :1].expand_as(all_depth[:, 1:]), all_depth[:, 1:]).tolist(),
+        "inpainted": float(torch.stack(inpainted).mean()),
+        "score": float(psnr.mean() + depth_psnr.mean()),
+    }
+    if flows:
+        predicted, true, hand = (torch.cat(parts) for parts in zip(*flows, strict=True))
+        scores.update(flow_scores(predicted, true, hand))
+        error, way = (torch.cat(parts) for parts in zip(*tracked, strict=True))
+        counts = way > MIN_WAY_M
+        scores["tracking_error"] = float(error[counts].mean() / way[counts].mean())
+    return scores
+
+
+def _track(model: T3VIP, clips: Clips, truth: ClipTruth, free: Rollout, context: int) -> tuple[Tensor, Tensor]:
+    """How far the TCP, moved by predicted transforms, is off at the clip's end, and how far it went, (B,) metres."""
+    points = clips.depth[:, context - 1] * model.rays
+    ends = []
+    for b in range(len(points)):
+        track = HandTrack.start(points[b], truth.tcp[b, context - 1].to(points), model.intrinsics, 1)
+        for prediction in free.predictions[context - 1 :]:
+            track = track.advance(prediction.transform[b : b + 1])
+        ends.append(track.tcp[0].cpu())
+    error = (torch.stack(ends) - truth.tcp[:, -1]).norm(dim=1)
+    return error, (truth.tcp[:, -1] - truth.tcp[:, context - 1]).norm(dim=1)
+
+
+def summary(scores: Scores) -> str:
+    """One line for people: gains over copying at the first and last step, and the motion scores."""
+    psnr, copy = scores["psnr"], scores["copy_psnr"]
+    depth, copy_depth = scores["depth_rmse"], scores["copy_depth_rmse"]
+    assert (
+        isinstance(psnr, list) and isinstance(copy, list) and isinstance(depth, list) and isinstance(copy_depth, list)
+    )
+    line = (
+        f"PSNR {psnr[0]:.1f} ({psnr[0] - copy[0]:+.1f}) to {psnr[-1]:.1f} ({psnr[-1] - copy[-1]:+.1f} dB over copy), "
+        f"depth RMSE {depth[-1] / copy_depth[-1]:.2f} of copying's, inpainted {100 * float(scores['inpainted']):.1f} %"  # type: ignore[arg-type]
+    )
+    if "flow_error_moving" in scores:
+        line += (
+            f", flow error {scores['flow_error_moving']:.2f} (hand {scores['flow_error_hand']:.2f}), false flow "
+            f"{1000 * float(scores['false_flow_m']):.2f} mm, tracking error {scores['tracking_error']:.2f}"  # type: ignore[arg-type]
+        )
+    return line
