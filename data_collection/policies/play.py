@@ -1,0 +1,84 @@
+"""Scripted play: reaches, pushes, grasps and fixtures strung together as a curious person at the controls would.
+
+Every second skill is free reaching, so that positions and velocities cover the whole workspace; between them the policy
+manipulates the fixtures and blocks in a random order, one after the other, without repeating itself before all have had
+their turn. It looks into the simulator; the data that it makes does not.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from data_collection.policies import play_skills as skills
+from data_collection.policies.play_motion import (
+    Follower,
+    Waypoint,
+    expected_steps,
+    hand_orientation,
+    rotation_between,
+)
+from data_collection.policies.play_scene import BLOCKS, FIXTURES, Scene
+
+REACHES = (0.15, 0.6, 0.25)  # probability of 0, 1 and 2 reaches after a manipulation
+
+
+class PlayPolicy:
+    """Plays with a tabletop environment; privileged. Skills that fail are abandoned after a while."""
+
+    def reset(self, env: gymnasium.Env, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._scene = Scene(env)
+        self._scale = np.asarray(self._scene.env.ACTION_SCALE[:6], dtype=np.float64)
+        self._follower = Follower(self._scale, rng)
+        self._things: list[str] = []
+        self._reaches = int(rng.integers(0, 3))
+        self._skill: skills.Skill = iter(())
+        self._next_waypoint()
+
+    def act(self, obs: dict[str, Any]) -> NDArray[Any]:
+        """The next action (7,) in [-1, 1]; `obs` is not looked at."""
+        if self._arrived():
+            self._next_waypoint()
+        waypoint = self._waypoint
+        position, orientation = self._scene.target
+        error = np.concatenate([waypoint.position - position, rotation_between(orientation, self._orientation)])
+        self._steps += 1
+        return np.append(self._follower.act(error, waypoint.speed, waypoint.noise), waypoint.gripper).astype(np.float32)
+
+    def _arrived(self) -> bool:
+        """Whether to go on: reached and dwelt there, or missed; a missed waypoint may end the skill."""
+        offset = self._waypoint.position - self._scene.tcp
+        if self._reached_at is None and offset @ offset < self._waypoint.tolerance**2:
+            self._reached_at = self._steps
+        if self._reached_at is not None:
+            return self._steps - self._reached_at >= self._waypoint.dwell
+        if self._steps < self._patience:
+            return False
+        if self._waypoint.required:
+            self._skill = iter(())
+        return True
+
+    def _next_waypoint(self) -> None:
+        waypoint = next(self._skill, None)
+        while waypoint is None:
+            self._skill = self._next_skill()
+            waypoint = next(self._skill, None)
+        self._waypoint: Waypoint = waypoint
+        waypoint.position = np.clip(waypoint.position, self._scene.low, self._scene.high)
+        self._orientation = hand_orientation(waypoint)
+        distance = float(np.abs(waypoint.position - self._scene.tcp).max())
+        self._steps, self._reached_at = 0, None
+        self._patience = expected_steps(distance, waypoint.speed, self._scale[0]) + waypoint.dwell + waypoint.patience
+
+    def _next_skill(self) -> skills.Skill:
+        if self._reaches > 0:
+            self._reaches -= 1
+            return skills.reach(self._scene, self._rng)
+        if not self._things:
+            self._things = list(self._rng.permutation(FIXTURES + BLOCKS))
+        self._reaches = int(self._rng.choice(3, p=REACHES))
+        return skills.manipulation(self._scene, self._rng, self._things.pop())
