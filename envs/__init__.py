@@ -2,10 +2,9 @@
 
 import gymnasium
 
-from envs.gl import leaving_mujoco_gl_alone
+from envs.gl import import_mujoco
 
-with leaving_mujoco_gl_alone():  # a bad MUJOCO_GL is reported when something is to be drawn, not by `import mujoco`
-    import mujoco as mujoco
+import_mujoco()  # first of all: whatever MUJOCO_GL says is judged when something is to be drawn
 
 TABLETOP_STEPS = 240  # 8 s at 30 Hz
 

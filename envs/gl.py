@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import importlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 from envs.errors import UsageError
@@ -18,26 +19,23 @@ REMEDY = "install software OpenGL: apt-get install libegl1 libgl1-mesa-dri (EGL)
 
 _CHOOSES_ITSELF = ("", "enable", "enabled", "on", "true", "1")
 _SWITCHED_OFF = ("disable", "disabled", "off", "false", "0")
-_KNOWN_TO_MUJOCO = (*_CHOOSES_ITSELF, *_SWITCHED_OFF, "egl", "osmesa", "glfw", "glx", "wgl", "cgl")
 _GL_RENDERER = 0x1F01
 
 
-@contextlib.contextmanager
-def leaving_mujoco_gl_alone() -> Iterator[None]:
-    """Import packages that read or write `MUJOCO_GL` inside of this.
+def import_mujoco() -> None:
+    """`import mujoco`, even where `MUJOCO_GL` names something unknown or not installed.
 
-    `import mujoco` raises on a value that it does not know (we want to say so ourselves, when something is to be
-    rendered), and `import robosuite` sets the variable to `egl`, which is no wish of the user's.
+    MuJoCo raises at import then. A user who draws nothing need not care, and one who does is told by `create_context`.
     """
-    wish = os.environ.get("MUJOCO_GL")
-    if wish is not None and wish.lower().strip() not in _KNOWN_TO_MUJOCO:
-        del os.environ["MUJOCO_GL"]
     try:
-        yield
-    finally:
+        importlib.import_module("mujoco")
+    except (RuntimeError, AttributeError, ImportError):
+        wish = os.environ.pop("MUJOCO_GL", None)
         if wish is None:
-            os.environ.pop("MUJOCO_GL", None)
-        else:
+            raise
+        try:
+            importlib.import_module("mujoco")
+        finally:
             os.environ["MUJOCO_GL"] = wish
 
 

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Any
 
-import cv2
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -95,14 +94,11 @@ class StaticCamera:
         """
         scene = self._draw(data)
         mujoco.mjr_readPixels(self._rgb, self._zbuffer, self._viewport, self._mjr)
-        height, width = self.geometry.height, self.geometry.width
-        rgb = self._rgb
-        if self.supersample > 1:
-            rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
         frustum = scene.camera[0]
         depth = metric_depth(self._centre_samples(self._zbuffer), frustum.frustum_near, frustum.frustum_far)
-        depth = np.clip(depth, self.geometry.near, self.geometry.far).astype(np.float32)
-        return np.ascontiguousarray(rgb[::-1]), np.ascontiguousarray(depth[::-1])
+        depth = np.clip(depth, self.geometry.near, self.geometry.far)
+        rgb = block_average(self._rgb, self.supersample)
+        return rgb[::-1].copy(), depth[::-1].astype(np.float32)
 
     def segment(self, data: mujoco.MjData) -> NDArray[np.int32]:
         """The body under each pixel centre, at the very samples that `render` takes depth from.
@@ -174,6 +170,19 @@ class StaticCamera:
     def _centre_samples(self, image: NDArray[Any]) -> NDArray[Any]:
         middle = self.supersample // 2
         return image[middle :: self.supersample, middle :: self.supersample]
+
+
+def block_average(image: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
+    """The mean of each block of `side` x `side` pixels, rounded half up: (H, W, C) to (H / side, W / side, C)."""
+    if side == 1:
+        return image
+    height, width, channels = image.shape
+    rows = image.reshape(height // side, side, width * channels).sum(1, dtype=np.uint32)
+    blocks = rows.reshape(height // side, width // side, side, channels)
+    total = blocks[:, :, 0].copy()
+    for column in range(1, side):  # much faster than a sum over an axis this short
+        total += blocks[:, :, column]
+    return ((total + side * side // 2) // (side * side)).astype(np.uint8)
 
 
 def metric_depth(zbuffer: NDArray[np.float32], near: float, far: float) -> NDArray[np.float64]:
