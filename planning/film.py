@@ -22,38 +22,56 @@ from planning.setups import Setup
 SIZE = 256  # pixels of each view
 VIEWS = ("static", "side")
 STRIP_FRAMES = 6
+STEPS_PER_FRAME, FPS = 2, 15  # real time, at 30 control steps a second
 GOAL_COLOUR, TCP_COLOUR = (230, 30, 30), (40, 200, 255)
+
+
+class Studio:
+    """The cameras that films are taken with; made once, for people only.
+
+    Args:
+        env: the tabletop environment; it is only looked at.
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        tabletop: Any = env.unwrapped
+        self.tabletop = tabletop
+        model, near, far = tabletop.mj_model, tabletop.camera.near, tabletop.camera.far
+        self.cameras = [StaticCamera(model, view, SIZE, SIZE, near, far) for view in VIEWS]
+
+    def close(self) -> None:
+        """Free the cameras."""
+        for camera in self.cameras:
+            camera.close()
 
 
 class Film:
     """Takes pictures of an episode, and writes them as a video and as a strip.
 
     Args:
-        env: the tabletop environment; it is only looked at.
+        studio: where.
         setup: whose goal is drawn.
         caption: text in the corner.
     """
 
-    def __init__(self, env: gym.Env, setup: Setup, caption: str) -> None:
-        tabletop: Any = env.unwrapped
-        self._tabletop = tabletop
-        model, camera = tabletop.mj_model, tabletop.camera
-        self._cameras = [StaticCamera(model, view, SIZE, SIZE, camera.near, camera.far) for view in VIEWS]
-        self._setup, self._caption = setup, caption
+    def __init__(self, studio: Studio, setup: Setup, caption: str) -> None:
+        self._studio, self._setup, self._caption = studio, setup, caption
         self._path: list[NDArray] = []
         self.frames: list[NDArray[np.uint8]] = []
 
     def watch(self, step: int) -> None:
-        """Take a picture of the environment as it stands."""
-        self._path.append(np.array(self._tabletop.tcp_position))
-        views = [self._view(camera) for camera in self._cameras]
+        """Note where the TCP is, and take a picture every other control step."""
+        self._path.append(np.array(self._studio.tabletop.tcp_position))
+        if step % STEPS_PER_FRAME:
+            return
+        views = [self._view(camera) for camera in self._studio.cameras]
         frame = np.concatenate(views, axis=1)
         left = np.linalg.norm(self._path[-1] - self._setup.goal.point_world)
         _write(frame, f"{self._caption}  step {step}  {100 * left:.1f} cm", (6, 14))
         self.frames.append(frame)
 
     def _view(self, camera: StaticCamera) -> NDArray[np.uint8]:
-        image = np.ascontiguousarray(camera.render(self._tabletop.mj_data)[0])
+        image = np.ascontiguousarray(camera.render(self._studio.tabletop.mj_data)[0])
         way = _pixels(camera.geometry, np.array(self._path))
         cv2.polylines(image, [way[:, None]], False, TCP_COLOUR, 1, cv2.LINE_AA, shift=4)
         goal = _pixels(camera.geometry, self._setup.goal.point_world[None])[0] >> 4
@@ -61,20 +79,14 @@ class Film:
         return image
 
     def save(self, path: Path) -> None:
-        """Write `path`.mp4 and `path`.png (a strip of some frames); then give the cameras back."""
+        """Write `path`.mp4 and `path`.png (a strip of some frames)."""
         path.parent.mkdir(parents=True, exist_ok=True)
         with written_aside(path.with_suffix(".mp4")) as aside:
-            iio.imwrite(aside, np.stack(self.frames), extension=".mp4", fps=15, macro_block_size=2)
+            iio.imwrite(aside, np.stack(self.frames), extension=".mp4", fps=FPS, output_params=["-f", "mp4"])
         chosen = np.unique(np.linspace(0, len(self.frames) - 1, STRIP_FRAMES).round().astype(int))
         rows = [np.concatenate(np.split(self.frames[i], len(VIEWS), axis=1), axis=0) for i in chosen]
         with written_aside(path.with_suffix(".png")) as aside:
             iio.imwrite(aside, np.concatenate(rows, axis=1), extension=".png")
-        self.close()
-
-    def close(self) -> None:
-        """Free the cameras."""
-        for camera in self._cameras:
-            camera.close()
 
 
 def _pixels(camera: CameraModel, points: NDArray) -> NDArray[np.int32]:

@@ -87,7 +87,7 @@ def _interval(interval: Sequence[float]) -> str:
 
 def bar_chart(models: dict[str, dict[str, Any]], path: Path, title: str) -> None:
     """Draw success in 2D and 3D, and 3D success by the way's direction, with 95 % intervals, as a PNG."""
-    figure = Figure(figsize=(4 + 1.6 * len(models), 3.6), layout="constrained")
+    figure = Figure(figsize=(4 + 1.6 * len(models), 3.8), layout="constrained")
     overall, split = figure.subplots(1, 2, sharey=True)
     _bars(overall, models, {"2D": lambda m: (m, "2d"), "3D": lambda m: (m, "3d")}, ("#9bb7d4", "#1f4e79"))
     sides = {
@@ -115,4 +115,4 @@ def _bars(axes: Any, models: dict[str, dict[str, Any]], series: dict[str, Any], 
     axes.set_ylim(0, 105)
     axes.grid(axis="y", alpha=0.3)
     axes.set_axisbelow(True)
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=len(series), frameon=False)

@@ -18,7 +18,7 @@ from data_collection.files import locked, write_json
 from envs.errors import UsageError
 from planning.controllers import CONTROLLERS, LEARNED, Kit
 from planning.episode import Record, run_episode
-from planning.film import Film
+from planning.film import Film, Studio
 from planning.icem import ICEMConfig
 from planning.records import EpisodeLog
 from planning.report import bar_chart, summarise, table
@@ -109,7 +109,13 @@ class ServoConfig:
 
 def main(config: ServoConfig) -> None:
     """Run what is missing, then report on everything."""
-    env = gym.make(f"envs:t3vip/Tabletop{config.scene}-v0", image_size=config.image_size, max_episode_steps=-1)
+    env = gym.make(
+        f"envs:t3vip/Tabletop{config.scene}-v0",
+        image_size=config.image_size,
+        max_episode_steps=-1,
+        disable_env_checker=True,
+    )
+    studio = Studio(env)
     try:
         kit = Kit(env, config.planner, config.hold, config.checkpoints(), config.device, config.deadline)
         learned = {name: kit.model(name) for name in config.model if name in LEARNED}
@@ -117,10 +123,11 @@ def main(config: ServoConfig) -> None:
         config.out.mkdir(parents=True, exist_ok=True)
         with locked(config.out):
             log = EpisodeLog(config.out, settings(config, kit.hold, learned))
-            for record in run_missing(config, env, kit, log):
+            for record in run_missing(config, env, studio, kit, log):
                 log.append(record)
             report(config, log)
     finally:
+        studio.close()
         env.close()
 
 
@@ -140,7 +147,7 @@ def weights_hash(model: Any) -> str:
     return digest.hexdigest()[:16]
 
 
-def run_missing(config: ServoConfig, env: gym.Env, kit: Kit, log: EpisodeLog) -> Iterator[Record]:
+def run_missing(config: ServoConfig, env: gym.Env, studio: Studio, kit: Kit, log: EpisodeLog) -> Iterator[Record]:
     """The episodes that the log does not hold yet, setup by setup, all models on the same one."""
     todo = [
         (setup, repeat, name)
@@ -157,7 +164,7 @@ def run_missing(config: ServoConfig, env: gym.Env, kit: Kit, log: EpisodeLog) ->
             entropy = (EPISODE_ENTROPY, config.seed, index, repeat)
             kit.rng = np.random.default_rng(np.random.SeedSequence(entropy))
             filmed = index * config.repeats + repeat < config.video
-            film = Film(env, setup, name) if filmed else None
+            film = Film(studio, setup, name) if filmed else None
             record = run_episode(
                 env, setup, CONTROLLERS[name](kit), config.steps, repeat, film.watch if film is not None else None
             )

@@ -1,0 +1,161 @@
+"""The evaluation as a whole: who arrives, what it writes, how it resumes, what it says about mistakes."""
+
+import dataclasses
+import json
+import sys
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import worldmodel
+from envs.errors import UsageError
+from planning import servo_eval
+from planning.controllers import CONTROLLERS, Goal, Kit
+from planning.episode import THRESHOLDS, run_episode
+from planning.film import Film, Studio
+from planning.servo_eval import ServoConfig, command, main
+from planning.setups import make_setup
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = gym.make("envs:t3vip/TabletopD-v0", max_episode_steps=-1, disable_env_checker=True)
+    yield env
+    env.close()
+
+
+@pytest.fixture
+def run(capsys, monkeypatch):
+    """Run the command as the shell does: (exit code, stdout, stderr)."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["servo-eval", *map(str, arguments)])
+        code = 0
+        try:
+            command()
+        except SystemExit as exit_:
+            code = exit_.code
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return run
+
+
+def episode(env, name, index, steps=100, kit=None):
+    kit = kit or Kit(env, rng=np.random.default_rng(index))
+    return run_episode(env, make_setup(env, index), CONTROLLERS[name](kit), steps)
+
+
+def test_oracle_arrives_and_random_does_not(env):
+    for index in range(2):
+        record = episode(env, "oracle", index)
+        assert record.success(0.1, "3d") and record.success(0.05, "3d") and record.success(0.1, "2d")
+        assert not episode(env, "random", index).success(0.1, "3d")
+
+
+def test_proportional_arrives_and_stops_when_nothing_is_left_to_find_out(env):
+    record = episode(env, "proportional", 0)
+    assert all(record.success(t, space) for t in THRESHOLDS for space in ("2d", "3d"))
+    assert record.steps < 100 and len(record.distances) == record.steps
+    assert record.final_distance == pytest.approx(record.distances[-1], abs=1e-5)
+
+
+def test_t3vip_arrives_in_the_simulator_with_an_exact_model(env, make_exact_model, monkeypatch):
+    monkeypatch.setattr(worldmodel, "load_model", lambda name: make_exact_model(env.unwrapped.camera), raising=False)
+    assert episode(env, "t3vip", 1).success(0.1, "3d")
+
+
+def test_pictures_do_not_know_the_goal(env):
+    """Bitwise: other goals, and a film that draws the goal, leave what the controller sees as it is."""
+    setup = make_setup(env, 2)
+    elsewhere = dataclasses.replace(setup, goal=Goal(setup.goal.point_world + 0.05, setup.goal.pixel + 3))
+    studio = Studio(env)
+    seen = []
+    for variant, film in ((setup, None), (elsewhere, None), (setup, Film(studio, setup, "film"))):
+        observations = []
+        inner = CONTROLLERS["random"](Kit(env, rng=np.random.default_rng(0)))
+
+        def act(observation, inner=inner, observations=observations):
+            observations.append({key: np.array(value) for key, value in observation.items()})
+            return inner.act(observation)
+
+        spy = SimpleNamespace(name="spy", plan_seconds=[0.0], reset=inner.reset, act=act)
+        run_episode(env, variant, spy, 6, watch=film.watch if film else None)
+        seen.append(observations)
+    studio.close()
+    for others in seen[1:]:
+        for one, other in zip(seen[0], others, strict=True):
+            for key in one:
+                np.testing.assert_array_equal(one[key], other[key])
+
+
+def test_command_writes_everything_and_resumes_episode_by_episode(tmp_path, run, monkeypatch):
+    options = ["--model", "proportional", "random", "--steps", 12, "--out", tmp_path]
+    code, out, _ = run(*options, "--episodes", 2, "--video", 1)
+    assert code == 0 and "proportional" in out
+    servo = json.loads((tmp_path / "servo.json").read_text())
+    entry = servo["models"]["random"]
+    assert entry["episodes"] == 2 and len(entry["success_3d_interval"]) == 2
+    for key in ("success_2d", "success_3d", "success_2d_interval", "final_distance_m_median", "plan_seconds_median"):
+        assert key in entry
+    assert (tmp_path / "success.png").stat().st_size > 1000
+    for suffix in ("mp4", "png"):
+        assert (tmp_path / "videos" / f"random-setup00-0.{suffix}").stat().st_size > 1000
+
+    # Cut off the last episode in the middle, as a kill would; the same command does that one again, and no other.
+    path = tmp_path / "episodes.jsonl"
+    whole = path.read_text()
+    path.write_text(whole[:-30])
+    ran = []
+    once = servo_eval.run_episode
+    monkeypatch.setattr(servo_eval, "run_episode", lambda *a, **k: ran.append(1) or once(*a, **k))
+    assert run(*options, "--episodes", 2)[0] == 0
+    assert len(ran) == 1
+
+    def timeless(text):
+        return [{**json.loads(line), "plan_seconds": 0} for line in text.splitlines()]
+
+    assert timeless(path.read_text()) == timeless(whole)
+    assert run(*options, "--episodes", 2)[0] == 0 and len(ran) == 1
+
+    code, _, err = run(*options, "--episodes", 2, "--seed", 1)
+    assert code == 2 and "seed" in err and err.count("\n") == 1
+
+
+def test_repeats_share_a_setup_but_not_their_randomness():
+    config = ServoConfig(out="x", model=("random",), setups=2, repeats=3)
+    assert config.attempts() == [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)]
+    assert len(ServoConfig(out="x", model=("random",)).attempts()) == 50
+    assert len(ServoConfig(out="x", model=("random",), episodes=5, repeats=2).attempts()) == 5
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["--model", "t4vip"], "t3vip"),
+        (["--model", "random", "random"], "once"),
+        (["--episodes", 0], "episodes"),
+        (["--planner.horizon", 0], "horizon"),
+        (["--model", "random", "--checkpoint", "/nowhere"], "checkpoint"),
+        (["--checkpoint", "sv2p=/nowhere"], "sv2p"),
+        (["--deadline", "-1"], "deadline"),
+    ],
+)
+def test_mistakes_are_one_line(tmp_path, run, options, word):
+    code, _, err = run("--out", tmp_path, *options)
+    assert code == 2 and word in err and err.count("\n") == 1 and "Traceback" not in err
+
+
+@pytest.mark.parametrize("wrong", ["env", "size", "action"])
+def test_a_checkpoint_that_does_not_fit_is_refused(env, tmp_path, make_exact_model, monkeypatch, wrong):
+    camera = env.unwrapped.camera
+    if wrong == "size":
+        camera = type(camera).from_fovy(48, 48, 10, np.eye(4), 3, 5)
+    model = make_exact_model(camera, action_dim=3 if wrong == "action" else 7)
+    if wrong == "env":
+        model.context.env_id = "t3vip/DexHand-v0"
+    monkeypatch.setattr(worldmodel, "load_model", lambda name: model, raising=False)
+    with pytest.raises(UsageError, match={"env": "DexHand", "size": "48", "action": "3 numbers"}[wrong]):
+        main(ServoConfig(out=tmp_path, model=("t3vip",), episodes=1))
