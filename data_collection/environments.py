@@ -12,6 +12,7 @@ import numpy as np
 
 import envs  # noqa: F401  (registers the environments)
 from envs.errors import UsageError
+from envs.gl import gl_renderer
 
 PACKAGES = ("t3vip", "mujoco", "robosuite", "gymnasium", "numpy", "h5py")
 NEEDED = ("camera", "get_state", "ACTION_AGGREGATION", "ACTION_SCALE", "control_rate")
@@ -70,7 +71,11 @@ def make_env(env_id: str, env_kwargs: dict[str, Any], ground_truth: bool) -> gym
 
 
 def describe_env(env: gymnasium.Env, env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
-    """The attributes of a shard that follow from the environment; call after the first `reset`."""
+    """The attributes of a shard that follow from the environment, which may state its own `gl_renderer`.
+
+    Raises:
+        UsageError: no OpenGL works.
+    """
     inner: Any = env.unwrapped
     camera = inner.camera
     attrs = {
@@ -87,7 +92,7 @@ def describe_env(env: gymnasium.Env, env_id: str, env_kwargs: dict[str, Any]) ->
         "body_names": list(getattr(inner, "body_names", [])),
         "hand_body_ids": [int(body) for body in getattr(inner, "hand_body_ids", ())],
         "versions": {package: _version(package) for package in PACKAGES},
-        "gl_renderer": str(getattr(inner, "gl_renderer", "unknown")),
+        "gl_renderer": inner.gl_renderer if hasattr(inner, "gl_renderer") else gl_renderer(),
     }
     if hasattr(inner, "workspace"):
         attrs["workspace"] = [np.asarray(corner, float).tolist() for corner in inner.workspace]

@@ -142,7 +142,7 @@ class _Worker:
             if not self.process.is_alive():
                 return "failed", _describe_exit(self.process.exitcode)
             return None
-        return "failed", f"hung: the episode was not done within {self._timeout:g} s"
+        return "failed", f"hung: the episode was not done in {self._timeout:g} s"
 
     def stop(self) -> None:
         """End the process now; SIGKILL, because a hung or stopped one heeds nothing else."""
@@ -162,17 +162,14 @@ def work(manifest: Manifest, folder: Path, supervisor: Connection, supervisor_pi
     with contextlib.suppress(_Orphaned, EOFError, BrokenPipeError, ConnectionResetError):
         try:
             env = make_env(manifest.env_id, manifest.env_kwargs, manifest.ground_truth)
+            attrs = describe_env(env, manifest.env_id, manifest.env_kwargs)
+            attrs |= {"policy": manifest.policy, "seed": manifest.seed}
             while True:
                 episode = supervisor.recv()
                 policy = make_policy(manifest.policy)
                 columns = collect_episode(
                     env, policy, manifest.steps, manifest.seed, episode, manifest.ground_truth, check_supervisor
                 )
-                attrs = {
-                    **describe_env(env, manifest.env_id, manifest.env_kwargs),
-                    "policy": manifest.policy,
-                    "seed": manifest.seed,
-                }
                 check_supervisor()
                 write_shard(shard_path(folder, episode), [columns], attrs, [episode])
                 supervisor.send(("collected", ""))

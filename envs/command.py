@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import re
 import sys
 from collections.abc import Callable, Sequence
 from typing import TypeVar
@@ -71,8 +70,13 @@ def parse(
 
 
 def _one_line(box: str) -> str:
-    """What tyro says in a frame: its first paragraph, as one line."""
-    lines = [line.strip("│ \t") for line in box.splitlines() if line.startswith("│")]
-    paragraph = lines[: next((i for i, line in enumerate(lines) if line.startswith("─")), None)]
-    said = re.sub(r"\s+", " ", " ".join(paragraph))
-    return f"{said.rstrip('.')}; --help lists the options"
+    """What tyro says in a frame, drawn or (where the terminal knows no more) in ASCII: its message, as one line."""
+    paragraphs: list[list[str]] = [[]]
+    for line in (line.strip("│╭╮╰╯ ") for line in box.splitlines()):
+        if line.startswith(("─", "--- ", "----")):
+            paragraphs.append([])
+        elif line:
+            paragraphs[-1].append(line)
+    drawn = "│" in box  # then the title is in the frame, else a paragraph of its own
+    message = [" ".join(paragraph) for paragraph in paragraphs if paragraph][0 if drawn else 1]
+    return f"{message.rstrip('.')}; --help lists the options"

@@ -1,14 +1,24 @@
+import contextlib
+import importlib
+import io
 import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest import mock
 
 import pytest
+
+from envs.command import run
 
 HERE = Path(__file__).parent
 if str(HERE) not in sys.path:  # spawned workers inherit it and find `standin`
     sys.path.insert(0, str(HERE))
 
+MODULES = {
+    "collect-rollouts": "data_collection.collect",
+    "inspect-dataset": "data_collection.inspect_dataset",
+}
 ENV_ID = "standin:standin/Square-v0"
 
 
@@ -21,8 +31,7 @@ def options(out, **changed):
 
 def start(command, arguments, **variables):
     """Start a command of the project in a process of its own."""
-    module = {"collect-rollouts": "collect", "inspect-dataset": "inspect_dataset"}[command]
-    code = f"from data_collection.{module} import command; command()"
+    code = f"from {MODULES[command]} import command; command()"
     environment = {**os.environ, "PYTHONPATH": str(HERE), **{k: str(v) for k, v in variables.items()}}
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, arguments)],
@@ -40,8 +49,19 @@ def finish(process):
 
 
 def call(command, arguments, **variables):
-    """Run a command to its end."""
-    return finish(start(command, arguments, **variables))
+    """Run a command to its end, in this process; its workers inherit the variables."""
+    module = importlib.import_module(MODULES[command])
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with (
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        mock.patch.dict(os.environ, {name: str(value) for name, value in variables.items()}),
+    ):
+        try:
+            run(module.Config, module.main, list(map(str, arguments)))
+        except SystemExit as stop:
+            code = stop.code
+    return code, out.getvalue(), err.getvalue()
 
 
 def assert_one_line_error(result, *words):

@@ -90,3 +90,15 @@ def reset_seed(seed: int, episode: int) -> int:
 
 
 gymnasium.register("standin/Square-v0", entry_point=StandIn)
+
+
+class Blind(gymnasium.Env):
+    """Neither camera nor images."""
+
+    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (3,), np.float32)
+
+    def __init__(self, image_size: int = 16) -> None:
+        pass
+
+
+gymnasium.register("standin/Blind-v0", entry_point=Blind)

@@ -1,0 +1,206 @@
+"""The collector: same episodes whoever collects them, resuming, workers that fail, bad input."""
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import assert_one_line_error, call, finish, options, start
+from standin import FAR, NEAR, StandIn, reset_seed
+
+from data_collection.collect import Config, main
+from data_collection.dataset import RGBDDataset
+from data_collection.files import locked
+from data_collection.policies.random import RandomPolicy
+from data_collection.repair import find_damage
+from data_collection.rollout import collect_episode
+from envs.errors import UsageError
+
+
+def test_episodes_are_as_the_environment_gave_them(collected):
+    dataset = RGBDDataset(collected)
+    assert dataset.episodes == 4 and dataset.has_ground_truth
+    assert (dataset.episode_lengths == 9).all()
+    assert dataset.attrs["action_aggregation"] == list(StandIn.ACTION_AGGREGATION)
+    assert dataset.attrs["workspace"] == [[-1, -1, 0], [1, 1, 0.1]]
+    episode = dataset.episode(1)
+    assert (episode["action"][-1] == 0).all() and episode["reward"][-1] == 0
+    env = StandIn()
+    obs, _ = env.reset(seed=reset_seed(0, 1))
+    for t in range(9):
+        np.testing.assert_array_equal(episode["rgb"][t], obs["rgb"])
+        np.testing.assert_array_equal(episode["state"][t], env.get_state())
+        np.testing.assert_array_equal(episode["segmentation"][t], env.segmentation())
+        depth = dataset.depth_metres(episode["depth"][t])
+        np.testing.assert_allclose(depth, obs["depth"], atol=(FAR - NEAR) / 65535)
+        obs, reward, *_ = env.step(episode["action"][t])
+        if t < 8:
+            assert episode["reward"][t] == np.float32(reward)
+
+
+def test_same_episodes_with_two_workers(collected, tmp_path):
+    code, _, err = call("collect-rollouts", options(tmp_path, workers=2, **{"ground-truth": True}))
+    assert code == 0, err
+    assert RGBDDataset(tmp_path).content_hash == RGBDDataset(collected).content_hash
+
+
+def test_episodes_and_runs_differ(collected):
+    dataset = RGBDDataset(collected)
+    actions = [dataset.episode(number)["action"] for number in range(4)]
+    env = StandIn()
+    actions.append(collect_episode(env, RandomPolicy(), 8, seed=0, episode=0)["action"])
+    actions.append(collect_episode(env, RandomPolicy(), 8, seed=1, episode=0)["action"])
+    for i in range(len(actions)):
+        for j in range(i):
+            assert not np.array_equal(actions[i], actions[j])
+
+
+def test_same_command_goes_on_and_a_larger_number_extends(tmp_path):
+    main(Config(**arguments(tmp_path, episodes=2)))
+    times = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*.h5")}
+    (tmp_path / "shard-00000.h5").unlink()
+    (tmp_path / "shard-00007.h5.123.tmp").write_bytes(b"half a shard")
+    main(Config(**arguments(tmp_path, episodes=3)))
+    assert RGBDDataset(tmp_path).episode_indices.tolist() == [0, 1, 2]
+    assert (tmp_path / "shard-00001.h5").stat().st_mtime_ns == times[tmp_path / "shard-00001.h5"]
+    assert not list(tmp_path.glob("*.tmp")) and find_damage(tmp_path) == []
+    assert json.loads((tmp_path / "dataset.json").read_text())["episodes"] == 3
+    for field, value in (("seed", 9), ("steps", 4), ("policy", "random"), ("image_size", 8), ("ground_truth", True)):
+        shown = "env_kwargs" if field == "image_size" else field
+        with pytest.raises(UsageError, match=rf"was collected with {shown} = .*{value}.*choose another --out"):
+            main(Config(**{**arguments(tmp_path, episodes=3), field: value}))
+
+
+def arguments(out, **changed):
+    return {
+        "out": out,
+        "env": "standin:standin/Square-v0",
+        "episodes": 4,
+        "steps": 8,
+        "policy": "noise",
+        "workers": 1,
+        "image_size": 16,
+        **changed,
+    }
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("kill", "killed by SIGKILL"),
+        ("hang", "hung: the episode was not done in 4 s"),
+        ("raise", "fell off the plane"),
+    ],
+)
+def test_failing_worker_is_named_and_replaced_and_costs_one_episode(collected, tmp_path, fault, said):
+    faulty = {"STANDIN_FAULT": fault, "STANDIN_EPISODE": reset_seed(0, 2), "STANDIN_MARK": tmp_path / "mark"}
+    given = options(tmp_path / "data", workers=2, **{"ground-truth": True, "episode-timeout": 4})
+    code, _, err = call("collect-rollouts", given, **faulty)
+    assert code == 0, err
+    lost = [line for line in err.replace("\r", "\n").splitlines() if " lost episode " in line]
+    assert len(lost) == 1 and "worker " in lost[0] and "pid " in lost[0], err
+    assert "lost episode 2: " in lost[0] and said in lost[0]
+    assert RGBDDataset(tmp_path / "data").content_hash == RGBDDataset(collected).content_hash
+
+
+def test_episode_that_always_fails_stops_the_run(tmp_path):
+    faulty = {"STANDIN_FAULT": "raise", "STANDIN_EPISODE": reset_seed(0, 1)}
+    result = call("collect-rollouts", options(tmp_path), **faulty)
+    assert_one_line_error(result, "episode 1 failed 3 times", "fell off the plane", "same command")
+    assert "RuntimeError: the square fell off the plane" in (tmp_path / "errors.log").read_text()
+    assert len(RGBDDataset(tmp_path)) == 1
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_signals_end_it_cleanly(tmp_path, number, code):
+    process = start("collect-rollouts", options(tmp_path, episodes=50), STANDIN_SLEEP=0.02)
+    wait_for(lambda: list(tmp_path.glob("*.h5")))
+    process.send_signal(number)
+    returned, _, err = finish(process)
+    assert returned == code and "Traceback" not in err, err
+    assert find_damage(tmp_path) == [] and not list(tmp_path.glob("*.tmp"))
+    with locked(tmp_path):
+        pass
+
+
+def test_sigkill_at_random_moments_costs_the_episodes_in_flight(collected, tmp_path):
+    """Whatever was there stays, what is there is whole, and the same command ends with the same dataset."""
+    rng = np.random.default_rng(int(time.time()))
+    command = options(tmp_path, workers=2, **{"ground-truth": True})
+    for _ in range(4):
+        before = {path.name: path.read_bytes() for path in tmp_path.glob("*.h5")}
+        process = start("collect-rollouts", command, STANDIN_SLEEP=0.05)
+        time.sleep(rng.uniform(0.2, 2.5))
+        process.kill()
+        finish(process)
+        for name, content in before.items():
+            assert (tmp_path / name).read_bytes() == content
+        assert find_damage(tmp_path) == []
+    code, _, err = call("collect-rollouts", command)
+    assert code == 0, err
+    assert RGBDDataset(tmp_path).content_hash == RGBDDataset(collected).content_hash
+    assert not list(tmp_path.glob("*.tmp"))
+
+
+def test_workers_end_when_the_collector_is_killed(tmp_path):
+    process = start("collect-rollouts", options(tmp_path, episodes=50, workers=2), STANDIN_SLEEP=0.02)
+    wait_for(lambda: list(tmp_path.glob("*.h5")))
+    listed = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text()
+    children = [int(pid) for pid in listed.split()]
+    process.kill()
+    finish(process)
+    assert children
+    wait_for(lambda: not any(os.path.exists(f"/proc/{pid}") for pid in children))
+
+
+def wait_for(condition, seconds=30.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.05)
+
+
+def test_two_collectors_in_one_folder(tmp_path):
+    with locked(tmp_path), pytest.raises(UsageError, match="another process is writing to"):
+        main(Config(**arguments(tmp_path)))
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"env": "kitchen"}, ("'kitchen'", "tabletop")),
+        ({"env": "tabletop", "scene": "E"}, ("'E'", "A, B, C, D")),
+        ({"env": "no_such_module:x/Y-v0"}, ("no_such_module:x/Y-v0",)),
+        ({"env": "CartPole-v1", "episodes": 0}, ("--episodes", "0")),
+        ({"workers": 0}, ("--workers", "0")),
+        ({"image-size": 2}, ("--image-size", "2")),
+        ({"env": "standin:standin/Nothing-v0"}, ("standin/Nothing-v0",)),
+    ],
+)
+def test_bad_options_are_one_line(tmp_path, changed, words):
+    assert_one_line_error(call("collect-rollouts", options(tmp_path / "data", **changed)), *words)
+
+
+def test_environment_that_does_not_observe_depth(tmp_path):
+    with pytest.raises(UsageError, match="has no attribute 'camera'"):
+        main(Config(**arguments(tmp_path, env="standin:standin/Blind-v0")))
+
+
+def test_damaged_shard_stops_resuming(collected, tmp_path):
+    main(Config(**arguments(tmp_path, episodes=1)))
+    (tmp_path / "shard-00000.h5").write_bytes(b"")
+    result = call("collect-rollouts", options(tmp_path, episodes=2))
+    assert_one_line_error(result, "shard-00000.h5 is damaged", "inspect-dataset", "--repair")
+
+
+class _NanPolicy(RandomPolicy):
+    def act(self, obs):
+        return np.full(3, np.nan)
+
+
+def test_actions_that_are_not_finite_are_refused():
+    with pytest.raises(ValueError, match="finite"):
+        collect_episode(StandIn(), _NanPolicy(), 4, seed=0, episode=0)

@@ -1,0 +1,272 @@
+"""What is written comes back, and what is wrong is named."""
+
+import json
+import multiprocessing
+import pickle
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from data_collection.dataset import RGBDDataset
+from data_collection.schema import DEPTH_STEPS, DamagedShard, dequantise_depth, episode_hash, quantise_depth, read_shard
+from data_collection.writer import read_episode, write_shard
+from envs.camera import CameraModel
+from envs.errors import UsageError
+
+CAMERA = CameraModel.from_fovy(16, 12, 30.0, np.eye(4), 1.0, 3.0)
+ATTRS = {
+    "env_id": "some/Env-v0",
+    "env_kwargs": {"image_size": 16},
+    "policy": "random",
+    "seed": 3,
+    "control_rate": 10.0,
+    "K": CAMERA.K,
+    "world_T_camera": CAMERA.world_T_camera,
+    "near": CAMERA.near,
+    "far": CAMERA.far,
+    "camera": json.loads(CAMERA.to_json()),
+    "action_aggregation": ["sum", "last"],
+    "action_scale": [0.1, 1.0],
+    "body_names": ["world"],
+    "hand_body_ids": [],
+    "versions": {},
+    "gl_renderer": "none",
+}
+
+
+def make_episode(rng, rows, ground_truth=False):
+    columns = {
+        "rgb": rng.integers(0, 256, (rows, 12, 16, 3), np.uint8),
+        "depth": rng.integers(0, DEPTH_STEPS + 1, (rows, 12, 16), np.uint16),
+        "action": rng.normal(size=(rows, 2)).astype(np.float32),
+        "proprio": rng.normal(size=(rows, 4)).astype(np.float32),
+        "state": rng.normal(size=(rows, 9)),
+        "reward": rng.normal(size=rows).astype(np.float32),
+    }
+    if ground_truth:
+        columns["segmentation"] = rng.integers(0, 9, (rows, 12, 16), np.uint8)
+        columns["body_pose"] = rng.normal(size=(rows, 3, 7)).astype(np.float32)
+    return columns
+
+
+@pytest.fixture
+def episodes():
+    rng = np.random.default_rng(0)
+    return [make_episode(rng, rows) for rows in (5, 1, 40)]
+
+
+@pytest.fixture
+def folder(tmp_path, episodes):
+    write_shard(tmp_path / "shard-00000.h5", episodes[:2], ATTRS, [0, 1])
+    write_shard(tmp_path / "shard-00001.h5", episodes[2:], ATTRS, [2])
+    return tmp_path
+
+
+def test_round_trip(folder, episodes):
+    dataset = RGBDDataset(folder)
+    assert dataset.episodes == len(dataset) == 3 and dataset.action_dim == 2
+    assert dataset.episode_lengths.tolist() == [5, 1, 40]
+    assert not dataset.has_ground_truth
+    np.testing.assert_array_equal(dataset.camera.K, CAMERA.K)
+    for name, value in ATTRS.items():
+        np.testing.assert_array_equal(dataset.attrs[name], value)
+    for number, written in enumerate(episodes):
+        read = dataset.episode(number)
+        start, stop = dataset.episode_slices[number]
+        assert read.keys() == written.keys()
+        for name, values in written.items():
+            assert read[name].dtype == values.dtype
+            np.testing.assert_array_equal(read[name], values)
+            np.testing.assert_array_equal(dataset.load(name)[start:stop], values)
+
+
+def test_ground_truth_is_seen_only_if_all_shards_have_it(tmp_path):
+    rng = np.random.default_rng(0)
+    write_shard(tmp_path / "shard-00000.h5", [make_episode(rng, 3, ground_truth=True)], ATTRS, [0])
+    assert RGBDDataset(tmp_path).has_ground_truth
+    write_shard(tmp_path / "shard-00001.h5", [make_episode(rng, 3)], ATTRS, [1])
+    assert not RGBDDataset(tmp_path).has_ground_truth
+    with pytest.raises(UsageError, match=r"shard-00001.h5 has no column 'segmentation'.*--ground-truth"):
+        RGBDDataset(tmp_path, ["rgb", "segmentation"])
+
+
+@given(st.lists(st.floats(0.5, 6.0), min_size=1), st.floats(0.5, 2.0), st.floats(0.01, 4.0))
+def test_depth_comes_back_to_half_a_step(metres, near, span):
+    far = near + span
+    depth = np.array(metres, np.float32)
+    back = dequantise_depth(quantise_depth(depth, near, far), near, far)
+    assert back.dtype == np.float32
+    half_step = span / DEPTH_STEPS / 2
+    np.testing.assert_allclose(back, np.clip(depth, near, far), atol=half_step + 1e-6, rtol=0)
+
+
+def test_reader_survives_spawn(folder):
+    dataset = RGBDDataset(folder)
+    dataset.load("rgb")  # used before it travels
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        there = pool.apply(RGBDDataset.episode, (dataset, 2))
+    here = pickle.loads(pickle.dumps(dataset)).episode(2)
+    np.testing.assert_array_equal(episode_hash(there), episode_hash(here))
+
+
+def test_content_hash_is_of_the_content(folder, episodes, tmp_path_factory):
+    other = tmp_path_factory.mktemp("other")
+    write_shard(other / "shard-00000.h5", episodes, {**ATTRS, "versions": {"numpy": "9"}}, [0, 1, 2])
+    assert RGBDDataset(other).content_hash == RGBDDataset(folder).content_hash
+    episodes[1]["rgb"][0, 0, 0, 0] ^= 1
+    write_shard(other / "shard-00000.h5", episodes, ATTRS, [0, 1, 2])
+    assert RGBDDataset(other).content_hash != RGBDDataset(folder).content_hash
+    episodes[1]["rgb"][0, 0, 0, 0] ^= 1
+    write_shard(other / "shard-00000.h5", episodes, {**ATTRS, "control_rate": 20.0}, [0, 1, 2])
+    assert RGBDDataset(other).content_hash != RGBDDataset(folder).content_hash
+
+
+def test_missing_folder_and_empty_folder(tmp_path):
+    with pytest.raises(UsageError, match=r"no dataset folder .*nowhere; .*collect-rollouts"):
+        RGBDDataset(tmp_path / "nowhere")
+    with pytest.raises(UsageError, match=r"no shard-\*\.h5 in .*; collect"):
+        RGBDDataset(tmp_path)
+
+
+def test_dataset_without_depth(folder):
+    with h5py.File(folder / "shard-00001.h5", "a") as file:
+        del file["depth"]
+    with pytest.raises(UsageError, match=r"shard-00001\.h5 has no column 'depth'"):
+        RGBDDataset(folder)
+    assert RGBDDataset(folder, ["rgb", "action"]).columns == ("rgb", "action")
+    with pytest.raises(UsageError, match="no column 'depth'"):
+        RGBDDataset(folder, ["rgb"]).load("depth")
+
+
+def _truncate(path):
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def _write_nonsense(path):
+    path.write_bytes(b"not HDF5 at all")
+
+
+def _empty(path):
+    path.write_bytes(b"")
+
+
+def _drop_attribute(path):
+    with h5py.File(path, "a") as file:
+        del file.attrs["camera"]
+
+
+def _spoil_attribute(path):
+    with h5py.File(path, "a") as file:
+        file.attrs["env_id"] = "{"
+
+
+def _drop_table(path):
+    with h5py.File(path, "a") as file:
+        del file["ep_len"]
+
+
+def _shorten_column(path):
+    with h5py.File(path, "a") as file:
+        values = file["reward"][:-1]
+        del file["reward"]
+        file["reward"] = values
+
+
+def _retype_column(path):
+    with h5py.File(path, "a") as file:
+        values = file["depth"][()].astype(np.float32)
+        del file["depth"]
+        file["depth"] = values
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        _truncate,
+        _write_nonsense,
+        _empty,
+        _drop_attribute,
+        _spoil_attribute,
+        _drop_table,
+        _shorten_column,
+        _retype_column,
+    ],
+)
+def test_damaged_shard_is_named_when_opened(folder, damage):
+    damage(folder / "shard-00001.h5")
+    with pytest.raises(
+        DamagedShard, match=r"shard-00001\.h5 is damaged \(.*\); drop it with: inspect-dataset .* --repair"
+    ):
+        RGBDDataset(folder)
+
+
+def flip_a_byte_of(path, column):
+    """Change the middle byte of a column's first stored chunk."""
+    with h5py.File(path, "r") as file:
+        place = file[column].id.get_chunk_info(0)
+    content = bytearray(path.read_bytes())
+    content[place.byte_offset + place.size // 2] ^= 0xFF
+    path.write_bytes(content)
+
+
+def test_damaged_chunk_is_named_when_read(folder):
+    flip_a_byte_of(folder / "shard-00001.h5", "rgb")
+    dataset = RGBDDataset(folder)
+    dataset.load("depth")
+    for read in (lambda: dataset.load("rgb"), lambda: dataset.episode(2)):
+        with pytest.raises(DamagedShard, match=r"shard-00001\.h5"):
+            read()
+
+
+def test_other_schema_version(folder):
+    with h5py.File(folder / "shard-00000.h5", "a") as file:
+        file.attrs["schema"] = 99
+    with pytest.raises(UsageError, match="schema version 99, this program reads 1"):
+        RGBDDataset(folder)
+
+
+def test_shards_of_different_datasets(folder, episodes):
+    write_shard(folder / "shard-00001.h5", episodes[2:], {**ATTRS, "env_id": "other/Env-v0"}, [2])
+    with pytest.raises(UsageError, match=r"shard-00001\.h5 has env_id = 'other/Env-v0'.*one dataset in a folder"):
+        RGBDDataset(folder)
+    episodes[2]["action"] = episodes[2]["action"][:, :1]
+    write_shard(folder / "shard-00001.h5", episodes[2:], ATTRS, [2])
+    with pytest.raises(UsageError, match="column 'action' has rows of"):
+        RGBDDataset(folder)
+
+
+def test_writer_refuses_what_the_schema_does_not_have(tmp_path, episodes):
+    path = tmp_path / "shard-00000.h5"
+    for spoil in (
+        lambda columns: columns.pop("depth"),
+        lambda columns: columns.update(extra=columns["reward"]),
+        lambda columns: columns.update(depth=columns["depth"].astype(np.float32)),
+        lambda columns: columns.update(reward=columns["reward"][:-1]),
+        lambda columns: columns.update(reward=columns["reward"] * np.nan),
+    ):
+        columns = dict(episodes[0])
+        spoil(columns)
+        with pytest.raises(ValueError):
+            write_shard(path, [columns], ATTRS, [0])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_shard_is_replaced_or_left(folder, episodes, monkeypatch):
+    """A writer that fails half-way leaves the shard that was there, and no other file."""
+    path = folder / "shard-00001.h5"
+    before = path.read_bytes()
+    monkeypatch.setattr("data_collection.files.os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(OSError, match="disk full"):
+        write_shard(path, episodes, ATTRS, [0, 1, 2])
+    assert path.read_bytes() == before and not list(folder.glob("*.tmp"))
+
+
+def test_shard_copied_elsewhere_reads_alone(folder, tmp_path_factory, episodes):
+    other = tmp_path_factory.mktemp("copy")
+    shutil.copy(folder / "shard-00001.h5", other)
+    shard = read_shard(other / "shard-00001.h5")
+    np.testing.assert_array_equal(read_episode(shard, 0)["rgb"], episodes[2]["rgb"])

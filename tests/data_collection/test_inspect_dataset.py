@@ -1,0 +1,119 @@
+"""Inspection says what is there; repair drops what is damaged and nothing else."""
+
+import json
+import shutil
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+from conftest import assert_one_line_error, call, options
+from test_dataset import ATTRS, flip_a_byte_of, make_episode
+
+from data_collection.dataset import RGBDDataset
+from data_collection.files import locked
+from data_collection.repair import find_damage, repair
+from data_collection.schema import episode_hash
+from data_collection.statistics import moved_shares, workspace_coverage
+from data_collection.writer import write_shard
+from envs.errors import UsageError
+
+
+@pytest.fixture
+def folder(collected, tmp_path):
+    return shutil.copytree(collected, tmp_path / "data")
+
+
+def test_report_table_and_pictures(folder):
+    code, out, err = call("inspect-dataset", [folder, "--clips", "3"])
+    assert code == 0, err
+    report = json.loads((folder / "inspection" / "inspection.json").read_text())
+    dataset = RGBDDataset(folder)
+    assert report["episodes"] == report["episodes_asked_for"] == 4 and report["frames"] == 36
+    assert report["content_hash"] == dataset.content_hash and dataset.content_hash in out
+    assert report["columns"]["depth"]["min"] == pytest.approx(1.5, abs=1e-3)
+    assert report["columns"]["depth"]["max"] == pytest.approx(2.5, abs=1e-3)
+    assert report["columns"]["rgb"]["max"] == 250
+    assert len(report["columns"]["action"]["std"]) == 3
+    assert 0 < report["workspace"]["share_of_cells_visited"] < 0.1
+    sheet = imageio.imread(folder / "inspection" / "contact_sheet.png")
+    assert sheet.shape == (3 * (2 * 128 + 4), 10 * (128 + 4), 3)
+    film = imageio.mimread(folder / "inspection" / "episodes.mp4", memtest=False)
+    assert len(film) == 9 and film[0].shape == (2 * 128 + 4, 3 * (128 + 4), 3)
+    assert np.ptp(film[0]) > 100
+
+
+def test_repair_drops_what_is_damaged_and_collecting_makes_it_again(folder):
+    whole = RGBDDataset(folder).content_hash
+    shard = folder / "shard-00001.h5"
+    shard.write_bytes(shard.read_bytes()[:-10])
+    flip_a_byte_of(folder / "shard-00003.h5", "depth")
+    (folder / "shard-00009.h5.77.tmp").touch()
+    assert_one_line_error(call("inspect-dataset", [folder]), "shard-00001.h5", "--repair")
+    code, out, err = call("inspect-dataset", [folder, "--repair", "--no-pictures"])
+    assert code == 0, err
+    for line in (
+        "removed shard-00009.h5.77.tmp",
+        "dropped all of shard-00001.h5",
+        "dropped episode 3 of shard-00003.h5",
+    ):
+        assert line in out
+    assert "2 of 4" in out
+    assert sorted(path.name for path in (folder / "damaged").iterdir()) == ["shard-00001.h5", "shard-00003.h5"]
+    assert RGBDDataset(folder).episode_indices.tolist() == [0, 2]
+    code, _, err = call("collect-rollouts", options(folder, **{"ground-truth": True}))
+    assert code == 0, err
+    assert RGBDDataset(folder).content_hash == whole
+    code, out, _ = call("inspect-dataset", [folder, "--repair", "--no-pictures"])
+    assert code == 0 and "nothing is damaged" in out
+
+
+def test_silent_damage_is_found(folder):
+    flip_a_byte_of(folder / "shard-00002.h5", "rgb")
+    assert [line for line in find_damage(folder) if "shard-00002.h5: episode 2" in line]
+    assert_one_line_error(call("inspect-dataset", [folder]), "shard-00002.h5", "checksum", "--repair")
+
+
+def test_intact_episodes_of_a_damaged_shard_are_kept(tmp_path):
+    rng = np.random.default_rng(0)
+    episodes = [make_episode(rng, 1000), make_episode(rng, 1000)]  # longer than a chunk
+    path = tmp_path / "shard-00000.h5"
+    write_shard(path, episodes, ATTRS, [4, 5])
+    flip_a_byte_of(path, "rgb")
+    assert repair(tmp_path) == ["dropped episode 4 of shard-00000.h5: checksum differs; kept as damaged/shard-00000.h5"]
+    dataset = RGBDDataset(tmp_path)
+    assert dataset.episode_indices.tolist() == [5]
+    np.testing.assert_array_equal(episode_hash(dataset.episode(0)), episode_hash(episodes[1]))
+
+
+def test_repair_waits_for_the_collector(folder, tmp_path):
+    with locked(folder), pytest.raises(UsageError, match="another process is writing"):
+        repair(folder)
+    assert_one_line_error(call("inspect-dataset", [tmp_path / "nowhere", "--repair"]), "nowhere")
+
+
+def test_missing_folder_and_unknown_flag(tmp_path):
+    assert_one_line_error(call("inspect-dataset", [tmp_path / "nowhere"]), "nowhere", "collect-rollouts")
+    code, _, err = call("inspect-dataset", [tmp_path, "--colour"])
+    assert code == 2 and "--colour" in err and "Traceback" not in err
+
+
+def test_moved_shares_count_episodes():
+    scene = np.zeros((3 * 10, 24))
+    slices = np.array([[0, 10], [10, 20], [20, 30]])
+    scene[5:10, 1] = 0.1  # the drawer opens in the first episode
+    scene[25:, 5] = 1.0  # the LED is lit in the third
+    scene[:, 6] = np.repeat([0.1, 0.2, 0.3], 10)  # the red block lies elsewhere in each, and stays there
+    scene[13:17, 14] = 0.05  # the blue block is lifted in the second
+    shares = moved_shares(scene, slices)
+    expected = {"drawer": 1 / 3, "led": 1 / 3, "block_blue": 1 / 3}
+    assert shares == {name: pytest.approx(expected.get(name, 0.0), abs=1e-3) for name in shares}
+
+
+def test_workspace_coverage_of_known_positions():
+    workspace = np.array([[0.0, 0, 0], [0.5, 0.5, 0.5]])
+    centres = (np.stack(np.meshgrid(*[np.arange(10)] * 3), axis=-1).reshape(-1, 3) + 0.5) * 0.05
+    full = workspace_coverage(centres, workspace)
+    assert full["share_of_cells_visited"] == 1 and full["evenness"] == pytest.approx(1)
+    assert full["share_of_frames_inside"] == 1
+    half = workspace_coverage(np.concatenate([centres[:250], centres[:250] + 9]), workspace)
+    assert half["share_of_cells_visited"] == 0.25 and half["share_of_frames_inside"] == 0.5
