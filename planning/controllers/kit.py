@@ -8,10 +8,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-import worldmodel
 from envs.camera import CameraModel
 from envs.errors import UsageError
 from planning.icem import ICEM, ICEMConfig
+from worldmodel import checkpoint
 
 TRANSLATION_LOW, TRANSLATION_HIGH = -np.ones(3), np.ones(3)
 
@@ -55,9 +55,9 @@ class Kit:
             UsageError: there is no such checkpoint, or it was trained for another environment.
         """
         if name not in self._models:
-            model = worldmodel.load_model(self.checkpoints.get(name, name))
+            model = checkpoint.load_model(self.checkpoints.get(name, name), self.device)
             _check_fits(name, model, self.env)
-            self._models[name] = model.to(self.device).eval()
+            self._models[name] = model
         return self._models[name]
 
 

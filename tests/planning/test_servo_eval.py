@@ -9,7 +9,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import worldmodel
 from envs.errors import UsageError
 from planning import servo_eval
 from planning.controllers import CONTROLLERS, Goal, Kit
@@ -17,6 +16,7 @@ from planning.episode import THRESHOLDS, run_episode
 from planning.film import Film, Studio
 from planning.servo_eval import ServoConfig, command, main
 from planning.setups import make_setup
+from worldmodel import checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_proportional_arrives_and_stops_when_nothing_is_left_to_find_out(env):
 
 
 def test_t3vip_arrives_in_the_simulator_with_an_exact_model(env, make_exact_model, monkeypatch):
-    monkeypatch.setattr(worldmodel, "load_model", lambda name: make_exact_model(env.unwrapped.camera), raising=False)
+    monkeypatch.setattr(checkpoint, "load_model", lambda name, device: make_exact_model(env.unwrapped.camera))
     assert episode(env, "t3vip", 1).success(0.1, "3d")
 
 
@@ -156,6 +156,6 @@ def test_a_checkpoint_that_does_not_fit_is_refused(env, tmp_path, make_exact_mod
     model = make_exact_model(camera, action_dim=3 if wrong == "action" else 7)
     if wrong == "env":
         model.context.env_id = "t3vip/DexHand-v0"
-    monkeypatch.setattr(worldmodel, "load_model", lambda name: model, raising=False)
+    monkeypatch.setattr(checkpoint, "load_model", lambda name, device: model)
     with pytest.raises(UsageError, match={"env": "DexHand", "size": "48", "action": "3 numbers"}[wrong]):
         main(ServoConfig(out=tmp_path, model=("t3vip",), episodes=1))
