@@ -228,7 +228,8 @@ def _camera_model(
 
 def _check_clipping(model: mujoco.MjModel, camera: CameraModel) -> None:
     near, far = (plane * model.stat.extent for plane in (model.vis.map.znear, model.vis.map.zfar))
-    if near > camera.near or far < camera.far:
+    rounding = 1 + 1e-5  # the model keeps single precision
+    if near > camera.near * rounding or far * rounding < camera.far:
         raise UsageError(
             f"the model is clipped to {near:.3g} .. {far:.3g} m, which does not hold the camera's working range"
             f" {camera.near:g} .. {camera.far:g} m; set <visual><map znear zfar/> (they are times <statistic extent/>)"

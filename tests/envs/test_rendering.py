@@ -240,6 +240,10 @@ def test_geometry_needs_no_opengl(world, make_camera, monkeypatch):
         camera.render(world[1])
 
 
+def test_the_working_range_may_be_all_of_the_clipped_one(make_camera):
+    make_camera(near=0.01, far=50.0)
+
+
 def test_metric_depth_at_the_planes():
     zbuffer = np.array([1.0, 0.0], np.float32)
     np.testing.assert_allclose(metric_depth(zbuffer, 0.5, 8.0), [0.5, 8.0], rtol=1e-12)
