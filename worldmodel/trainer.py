@@ -256,7 +256,7 @@ def _ramp(x: float, low: float, high: float) -> float:
 
 
 def _mix(seed: int, step: int) -> int:
-    return int(np.random.SeedSequence((seed, step, 1)).generate_state(1, np.uint64)[0] >> 1)
+    return int(np.random.SeedSequence((seed, step, 1)).generate_state(1, np.uint64)[0]) >> 1
 
 
 @contextmanager
