@@ -16,14 +16,16 @@ from numpy.typing import NDArray
 from data_collection.policies import play_skills as skills
 from data_collection.policies.play_motion import (
     Follower,
-    Waypoint,
     expected_steps,
     hand_orientation,
     rotation_between,
 )
-from data_collection.policies.play_scene import BLOCKS, FIXTURES, Scene
+from data_collection.policies.play_scene import Scene
+from envs.tabletop.table import BLOCKS
 
-REACHES = (0.15, 0.6, 0.25)  # probability of 0, 1 and 2 reaches after a manipulation
+WEIGHTS = {"drawer": 1.7, "door": 1.2, "switch": 1.3, "button": 1.2} | dict.fromkeys(BLOCKS, 1.0)  # sooner or later
+REACHES = (0.05, 0.5, 0.45)  # probability of 0, 1 and 2 reaches after a manipulation
+STALLED, STALLED_STEPS = 0.001, 10  # m a step, steps: a hand that does not get on any more
 
 
 class PlayPolicy:
@@ -37,6 +39,9 @@ class PlayPolicy:
         self._things: list[str] = []
         self._reaches = int(rng.integers(0, 3))
         self._skill: skills.Skill = iter(())
+        self._steps = self._stalled = self._patience = 0
+        self._reached_at: int | None = None
+        self._last_tcp = self._scene.tcp
         self._next_waypoint()
 
     def act(self, obs: dict[str, Any]) -> NDArray[Any]:
@@ -44,19 +49,23 @@ class PlayPolicy:
         if self._arrived():
             self._next_waypoint()
         waypoint = self._waypoint
-        position, orientation = self._scene.target
-        error = np.concatenate([waypoint.position - position, rotation_between(orientation, self._orientation)])
+        target = self._scene.env.target_pose
+        turn = rotation_between(target.quaternion, self._orientation)
+        error = np.concatenate([waypoint.position - target.position, turn])
         self._steps += 1
         return np.append(self._follower.act(error, waypoint.speed, waypoint.noise), waypoint.gripper).astype(np.float32)
 
     def _arrived(self) -> bool:
         """Whether to go on: reached and dwelt there, or missed; a missed waypoint may end the skill."""
-        offset = self._waypoint.position - self._scene.tcp
+        tcp = self._scene.tcp
+        offset, moved = self._waypoint.position - tcp, tcp - self._last_tcp
+        self._last_tcp = tcp
         if self._reached_at is None and offset @ offset < self._waypoint.tolerance**2:
             self._reached_at = self._steps
         if self._reached_at is not None:
             return self._steps - self._reached_at >= self._waypoint.dwell
-        if self._steps < self._patience:
+        self._stalled = self._stalled + 1 if moved @ moved < STALLED**2 else 0
+        if self._steps < self._patience and self._stalled < STALLED_STEPS:
             return False
         if self._waypoint.required:
             self._skill = iter(())
@@ -67,18 +76,23 @@ class PlayPolicy:
         while waypoint is None:
             self._skill = self._next_skill()
             waypoint = next(self._skill, None)
-        self._waypoint: Waypoint = waypoint
         waypoint.position = np.clip(waypoint.position, self._scene.low, self._scene.high)
-        self._orientation = hand_orientation(waypoint)
-        distance = float(np.abs(waypoint.position - self._scene.tcp).max())
-        self._steps, self._reached_at = 0, None
-        self._patience = expected_steps(distance, waypoint.speed, self._scale[0]) + waypoint.dwell + waypoint.patience
+        self._waypoint = waypoint
+        if waypoint.yaw is None:
+            self._orientation = self._scene.env.target_pose.quaternion
+        else:
+            self._orientation = hand_orientation(waypoint.yaw, waypoint.tilt)
+        self._last_tcp = self._scene.tcp
+        distance = float(np.abs(waypoint.position - self._last_tcp).max())
+        self._patience = expected_steps(distance, waypoint.speed, self._scale[0]) + waypoint.patience
+        self._steps, self._stalled, self._reached_at = 0, 0, None
 
     def _next_skill(self) -> skills.Skill:
         if self._reaches > 0:
             self._reaches -= 1
             return skills.reach(self._scene, self._rng)
         if not self._things:
-            self._things = list(self._rng.permutation(FIXTURES + BLOCKS))
+            shares = np.array(list(WEIGHTS.values())) / sum(WEIGHTS.values())
+            self._things = list(self._rng.choice(list(WEIGHTS), len(WEIGHTS), replace=False, p=shares))
         self._reaches = int(self._rng.choice(3, p=REACHES))
-        return skills.manipulation(self._scene, self._rng, self._things.pop())
+        return skills.manipulation(self._scene, self._rng, self._things.pop(0))

@@ -7,6 +7,7 @@ velocity, so that the hand wanders smoothly instead of trembling; it fades where
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import mujoco
@@ -19,8 +20,9 @@ Array = NDArray[np.float64]
 
 GAIN = 0.25  # wanted velocity per unit of error, per control step
 AGILITY = 0.5  # share of the way to the wanted velocity that is made in one control step
-BRAKING = 0.12  # deceleration that the follower plans for, share of the action range per control step
+BRAKING = 0.2  # deceleration that the follower plans for, share of the action range per control step
 NOISE_BETA = 1.5  # between pink and red
+NOISE_SHARES = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])  # less in the rotations
 NOISE_PERIOD = 512  # control steps after which the noise repeats
 POINTING_DOWN = np.array([0.0, 0.5**0.5, 0.5**0.5, 0.0])  # wxyz; the fingers open along x
 
@@ -31,10 +33,10 @@ class Waypoint:
 
     Attributes:
         position: (3,) TCP position in the world, metres.
-        yaw: rotation of the fingers about the vertical, radians.
+        yaw: rotation of the fingers about the vertical, radians; None keeps the orientation as it is.
         tilt: (2,) further rotation about the world's x and y, radians.
         gripper: 1 opens, -1 closes.
-        speed: largest velocity along an axis, as a share of the action range.
+        speed: largest velocity along an axis, as a share of the action range; above 1 several axes are at their limit.
         tolerance: distance at which the waypoint counts as reached, metres.
         dwell: control steps to stay after reaching it.
         noise: standard deviation of the velocity noise, as a share of the action range.
@@ -43,8 +45,8 @@ class Waypoint:
     """
 
     position: Array
-    yaw: float = 0.0
-    tilt: tuple[float, float] = (0.0, 0.0)
+    yaw: float | None = None
+    tilt: Sequence[float] | Array = (0.0, 0.0)
     gripper: float = 1.0
     speed: float = 0.6
     tolerance: float = 0.02
@@ -76,7 +78,7 @@ class Follower:
 
         Args:
             error: (6,) from the target pose to the waypoint: metres, then rotation vector in the world, radians.
-            speed: largest velocity along an axis, share of the action range.
+            speed: largest velocity along an axis, share of the action range; above 1 it saturates.
             noise: standard deviation of the noise on the velocity, share of the action range.
 
         Returns:
@@ -90,14 +92,14 @@ class Follower:
             if largest > limit:
                 wanted[part] *= limit / largest
         self._velocity += AGILITY * (wanted - self._velocity)
-        action = self._velocity + noise * self._noise[self._step % NOISE_PERIOD]
+        action = self._velocity + noise * NOISE_SHARES * self._noise[self._step % NOISE_PERIOD]
         self._step += 1
         return np.clip(action, -1.0, 1.0)
 
 
 def expected_steps(distance: float, speed: float, full_speed: float) -> int:
-    """Control steps that the follower takes over `distance` metres at `speed` (share of `full_speed`, metres a step)."""
-    return int(distance / (speed * full_speed)) + 8
+    """Control steps that the follower takes over `distance`, m, at `speed`, a share of `full_speed`, m a step."""
+    return int(distance / (min(speed, 1.0) * full_speed)) + 8
 
 
 def rotation_between(start: Array, end: Array) -> Array:
@@ -109,11 +111,11 @@ def rotation_between(start: Array, end: Array) -> Array:
     return vector
 
 
-def hand_orientation(waypoint: Waypoint) -> Array:
-    """Orientation (4,) wxyz of the waypoint; at yaw 0 the hand points down and its fingers open along x."""
-    yaw, tilt, turned, result = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
-    mujoco.mju_axisAngle2Quat(yaw, np.array([0.0, 0.0, 1.0]), waypoint.yaw)
-    mujoco.mju_euler2Quat(tilt, np.array([*waypoint.tilt, 0.0]), "XYZ")
-    mujoco.mju_mulQuat(turned, yaw, POINTING_DOWN)
-    mujoco.mju_mulQuat(result, tilt, turned)
+def hand_orientation(yaw: float, tilt: Sequence[float] | Array) -> Array:
+    """Orientation (4,) wxyz of the hand; without yaw and tilt it points down and its fingers open along x."""
+    about_z, about_xy, turned, result = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
+    mujoco.mju_axisAngle2Quat(about_z, np.array([0.0, 0.0, 1.0]), yaw)
+    mujoco.mju_euler2Quat(about_xy, np.array([*tilt, 0.0]), "XYZ")
+    mujoco.mju_mulQuat(turned, about_z, POINTING_DOWN)
+    mujoco.mju_mulQuat(result, about_xy, turned)
     return result

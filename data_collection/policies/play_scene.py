@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import gymnasium
 import mujoco
 import numpy as np
 
 from data_collection.policies.play_motion import Array
+from envs.tabletop import TabletopEnv
 from envs.tabletop.robot import BASE_POSITION
 from envs.tabletop.table import CABINET_TOP, HALF_DEPTH, SLOPE_FOOT, SLOPE_OUT
 from envs.tabletop.table import TOP as TABLE_TOP
 
-BLOCKS = ("block_red", "block_blue", "block_pink")
-FIXTURES = ("drawer", "door", "button", "switch")
 HANDLES = {"drawer": "drawer_handle", "door": "door_handle", "button": "button_top", "switch": "switch_tip"}
 
 # Where the hand can be while it points down: the wrist, this far from the TCP towards the base and upwards, has to
@@ -38,30 +38,26 @@ class Scene:
     """Reads a tabletop environment."""
 
     def __init__(self, env: gymnasium.Env) -> None:
-        self.env = env.unwrapped
+        self.env = cast(TabletopEnv, env.unwrapped)
         self.model: mujoco.MjModel = self.env.mj_model
         self.data: mujoco.MjData = self.env.mj_data
-        self.low, self.high = (np.asarray(bound, dtype=np.float64) for bound in self.env.workspace)
+        self.low, self.high = self.env.workspace
+        self._tcp_site = self.model.site("tcp").id
         self.optical_axis: Array = self.env.camera.world_T_camera[:3, 2]
 
     @property
     def tcp(self) -> Array:
         """Measured position of the tool centre point (3,), metres."""
-        return np.asarray(self.env.tcp_position, dtype=np.float64)
-
-    @property
-    def target(self) -> tuple[Array, Array]:
-        """Target pose of the tool centre point: position (3,), metres, and quaternion (4,) wxyz."""
-        body = self.data.body("target")
-        return body.xpos, body.xquat
+        return self.data.site_xpos[self._tcp_site].copy()
 
     def free(self, point: Array) -> bool:
-        """Whether the hand, pointing down, can be at a point (3,) without being in the table or the cabinet."""
+        """Whether the hand, pointing down, can be at a point (3,): in the workspace and in reach, in no furniture."""
+        inside = (point > self.low).all() and (point < self.high).all()
         radius = float(np.hypot(*(point[:2] - BASE_POSITION[:2])))
         wrist = (radius - WRIST_BACK) ** 2 + (point[2] + WRIST_UP - BASE_POSITION[2] - SHOULDER_HEIGHT) ** 2
         over_table = point[2] > TABLE_TOP + GAP or point[1] < -HALF_DEPTH - 2 * GAP
         over_cabinet = point[2] > CABINET_TOP + 2 * GAP or (point - SLOPE_FOOT) @ SLOPE_OUT > 2 * GAP
-        return bool(radius > NEAREST and wrist < ARM_LENGTH**2 and over_table and over_cabinet)
+        return bool(inside and radius > NEAREST and wrist < ARM_LENGTH**2 and over_table and over_cabinet)
 
     def handle(self, fixture: str) -> Array:
         """Where to take hold of a fixture (3,), metres."""
