@@ -25,10 +25,10 @@ class ModelConfig:
     """One latent a step, one a clip, or none (the deterministic T3VIP-D)."""
     act_cond: bool = True
     """Whether the model sees actions."""
-    splat: SplatMode = "softmax"
-    """How points that land on the same pixel share it; `softmax` lets the nearer one win."""
-    splat_sharpness: float = 15.0
-    """Of `softmax`, in 1/metre. Training rises to it from 0 (see TrainConfig.sharpen)."""
+    splat: SplatMode = "over"
+    """How points that land on the same pixel share it: `over` lays the nearer over the farther."""
+    splat_sharpness: float = 3.0
+    """Of splat `softmax`, in 1/metre."""
     mask_head_std: float = 0.5
     """Initial spread of the mask head's weights. Masks that start out alike never come apart."""
 

@@ -27,9 +27,6 @@ class Schedule:
     """Before this, latents are drawn from the prior; from here on from the inference network."""
     kl_ramp: tuple[float, float] = (0.5, 0.6)
     """The KL weight rises from 0 to its value between these."""
-    sharpen: tuple[float, float] = (0.15, 0.4)
-    """The sharpness of softmax splatting rises from 0 to its value between these: sharp from the start, any motion
-    thickens the outline of what moves, and the model learns that nothing ever does."""
     clip_lengths: tuple[tuple[float, int], ...] = ((0.3, 4), (0.6, 8), (1.0, 12))
     """Until which fraction of the run clips have how many frames: short clips first, where a step is cheap."""
 

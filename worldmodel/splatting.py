@@ -12,9 +12,13 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-SplatMode = Literal["average", "softmax", "sum"]
+SplatMode = Literal["over", "average", "softmax", "sum"]
 MIN_COVERAGE = 0.5
 """A pixel on which less than half a pixel's worth of source points lands counts as disoccluded."""
+
+LAYER_GAP_M = 0.01
+"""In mode `over`, a point this much in front of, or behind, the mean of all that land around it is another layer."""
+MIN_WEIGHT = 1e-4
 
 _FAR_OUTSIDE = 4.0  # in normalised coordinates, where the picture is [-1, 1]: dropped by zero padding
 _BILINEAR, _ZEROS, _ALIGN_CORNERS = 0, 0, True
@@ -57,23 +61,44 @@ def splat_sum(values: Tensor, pixels: Tensor) -> Tensor:
     Returns:
         (B, C, H, W), differentiable in both arguments.
     """
-    height, width = values.shape[-2:]
+    return _BilinearSplat.apply(values.contiguous(), _grid(pixels))
+
+
+def _grid(pixels: Tensor) -> Tensor:
+    """Pixels as `grid_sample` wants them: (B, H, W, 2) with the picture in [-1, 1]."""
+    height, width = pixels.shape[-2:]
     scale = pixels.new_tensor([2.0 / max(width - 1, 1), 2.0 / max(height - 1, 1)]).view(2, 1, 1)
-    grid = (pixels * scale - 1.0).clamp(-_FAR_OUTSIDE, _FAR_OUTSIDE).permute(0, 2, 3, 1).contiguous()
-    return _BilinearSplat.apply(values.contiguous(), grid)
+    return (pixels * scale - 1.0).clamp(-_FAR_OUTSIDE, _FAR_OUTSIDE).permute(0, 2, 3, 1).contiguous()
+
+
+@torch.no_grad()
+def _visible(pixels: Tensor, depth: Tensor, in_front: Tensor) -> Tensor:
+    """How much of each point is seen when nearer points lie over it, in [0, 1]: (B, 1, H, W).
+
+    Around the place where a point lands, what is nearer than the mean forms the upper layer; a point behind the mean
+    is hidden by as much as the upper layer covers there. So a surface that moves by a tenth of a pixel hides a tenth
+    of the next pixel, where weights like exp(-5 z) would have it hide the whole pixel.
+    """
+    grid = _grid(pixels)
+    depth_sum, count = _scatter(torch.cat((depth * in_front, in_front), dim=1), grid).split(1, dim=1)
+    mean = torch.grid_sampler_2d(depth_sum / count.clamp(min=1e-6), grid, _BILINEAR, _ZEROS, _ALIGN_CORNERS)
+    upper = in_front * (depth < mean - LAYER_GAP_M)
+    cover = torch.grid_sampler_2d(_scatter(upper, grid), grid, _BILINEAR, _ZEROS, _ALIGN_CORNERS)
+    return torch.where(depth > mean + LAYER_GAP_M, 1 - cover.clamp(0, 1), 1.0)
 
 
 def splat(
-    values: Tensor, pixels: Tensor, depth: Tensor, mode: SplatMode = "average", sharpness: float = 0.0
+    values: Tensor, pixels: Tensor, depth: Tensor, mode: SplatMode = "over", sharpness: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """Forward-warp a picture (softmax splatting, Niklaus and Liu 2020), points behind the camera dropped.
+    """Forward-warp a picture (after softmax splatting, Niklaus and Liu 2020), points behind the camera dropped.
 
     Args:
         values: (B, C, H, W).
         pixels: (B, 2, H, W), target places in pixels.
         depth: (B, 1, H, W), depth of the moved points in metres: nearer ones win in mode `softmax`.
-        mode: `average` shares a pixel among all that land on it, `softmax` weights them by exp(-sharpness * depth),
-            `sum` adds them up.
+        mode: `average` shares a pixel among all that land on it; `over` lays nearer points over farther ones as far as
+            they cover them (no gradient through who covers whom); `softmax` weights by exp(-sharpness * depth);
+            `sum` adds up.
         sharpness: in 1/metre, for `softmax`; 0 is `average`.
 
     Returns:
@@ -82,6 +107,8 @@ def splat(
     """
     in_front = (depth > 1e-3).to(values.dtype)
     weights = in_front
+    if mode == "over":
+        weights = in_front * _visible(pixels.detach(), depth.detach(), in_front).clamp(min=MIN_WEIGHT)
     if mode == "softmax" and sharpness > 0:
         # Shifting by the mean leaves the result as it is and keeps the exponential within range.
         weights = in_front * torch.exp((sharpness * (depth.mean((1, 2, 3), keepdim=True) - depth)).clamp(-30, 30))

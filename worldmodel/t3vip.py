@@ -131,7 +131,6 @@ class T3VIP(nn.Module):
         self.register_buffer("grid", geometry.pixel_grid(height, width), persistent=False)
         self.register_buffer("action_mean", torch.tensor(context.action_mean), persistent=False)
         self.register_buffer("action_std", torch.tensor(context.action_std), persistent=False)
-        self.splat_sharpness = config.splat_sharpness
         self.fast_network: Callable[..., tuple[Tensor, Tensor, Tensor, Tensor, Memory]] | None = None
 
     @property
@@ -251,7 +250,7 @@ class T3VIP(nn.Module):
         pixels = geometry.project(moved, self.intrinsics)
         moved_depth = moved[:, 2:]
         warped, coverage = splat(
-            torch.cat((rgb, moved_depth), dim=1), pixels, moved_depth, self.config.splat, self.splat_sharpness
+            torch.cat((rgb, moved_depth), dim=1), pixels, moved_depth, self.config.splat, self.config.splat_sharpness
         )
         occlusion = (coverage < MIN_COVERAGE).float()
         near, far = self.camera.near, self.camera.far

@@ -135,8 +135,6 @@ class Trainer:
         options, weights = self.options, self.options.losses
         noise = torch.Generator().manual_seed(_mix(options.seed, self.step))
         schedule = options.schedule
-        low, high = schedule.sharpen
-        self.model.splat_sharpness = self.model.config.splat_sharpness * _ramp(self.progress, low, high)
         truth = 1 - _ramp(self.progress, 0.0, schedule.truth_until)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=options.precision == "bfloat16"):
             latents, kl = self._latents(clips, noise)
@@ -146,7 +144,7 @@ class Trainer:
             terms["kl"] = kl
         scale = {**asdict(weights), "kl": weights.kl * _ramp(self.progress, *schedule.kl_ramp)}
         total = torch.stack([scale[name] * value for name, value in terms.items()]).sum()
-        return total, {"loss": float(total), **{name: float(value) for name, value in terms.items()}}
+        return total, {"loss": float(total.detach()), **{name: float(value.detach()) for name, value in terms.items()}}
 
     @property
     def progress(self) -> float:
@@ -192,13 +190,11 @@ class Trainer:
             truth = self.validation.source.truth_at(starts[:1], self.validation.frames)
         picture = self.options.out / "pictures" / f"step-{self.step:08d}.png"
         picture_prediction(self.model, clips, truth, self.options.context, picture)
-        # Only from where splatting has its final sharpness are two scores of one run scores of the same program.
-        if self.progress >= self.options.schedule.sharpen[1] or self.step == self.options.steps:
-            score = float(scores["score"])  # type: ignore[arg-type]
-            if score >= self.best:
-                self.best = score
-                origin = self.origin | {"step": self.step, "seconds": round(self.seconds), "validation": scores}
-                save_model(self.model, self.options.out / "model", origin)
+        score = float(scores["score"])  # type: ignore[arg-type]
+        if score >= self.best:
+            self.best = score
+            origin = self.origin | {"step": self.step, "seconds": round(self.seconds), "validation": scores}
+            save_model(self.model, self.options.out / "model", origin)
 
     def _save(self) -> None:
         state = {"step": self.step, "best": self.best, "seconds": self.seconds}
