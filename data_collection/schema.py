@@ -143,8 +143,9 @@ def read_shard(path: Path) -> Shard:
     try:
         with h5py.File(path, "r") as file:
             attrs = _read_attributes(path, file)
-            tables = {name: file[name][()] for name in EPISODE_TABLES if name in file}
-            columns = {name: (file[name].shape, str(file[name].dtype)) for name in file if name not in EPISODE_TABLES}
+            stored = dict(file.items())
+            tables = {name: stored.pop(name)[()] for name in EPISODE_TABLES if name in stored}
+            columns = {name: (column.shape, str(column.dtype)) for name, column in stored.items()}
     except (OSError, KeyError, RuntimeError, ValueError) as error:
         if isinstance(error, UsageError):
             raise
