@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from data_collection.policies import play_skills as skills
 from data_collection.policies.play_motion import (
+    Array,
     Follower,
     expected_steps,
     hand_orientation,
@@ -48,26 +49,30 @@ class PlayPolicy:
         """The next action (7,) in [-1, 1]; `obs` is not looked at."""
         if self._arrived():
             self._next_waypoint()
-        waypoint = self._waypoint
+        self._steps += 1
+        motion = self._follower.act(self._error(), self._waypoint.speed, self._waypoint.noise)
+        return np.append(motion, self._waypoint.gripper).astype(np.float32)
+
+    def _error(self) -> Array:
+        """From the target pose to the waypoint: (6,) metres, then rotation vector in the world, radians."""
         target = self._scene.env.target_pose
         turn = rotation_between(target.quaternion, self._orientation)
-        error = np.concatenate([waypoint.position - target.position, turn])
-        self._steps += 1
-        return np.append(self._follower.act(error, waypoint.speed, waypoint.noise), waypoint.gripper).astype(np.float32)
+        return np.concatenate([self._waypoint.position - target.position, turn])
 
     def _arrived(self) -> bool:
         """Whether to go on: reached and dwelt there, or missed; a missed waypoint may end the skill."""
-        tcp = self._scene.tcp
-        offset, moved = self._waypoint.position - tcp, tcp - self._last_tcp
+        waypoint, tcp = self._waypoint, self._scene.tcp
+        offset, moved = waypoint.position - tcp, tcp - self._last_tcp
         self._last_tcp = tcp
-        if self._reached_at is None and offset @ offset < self._waypoint.tolerance**2:
+        near = offset @ offset < waypoint.tolerance**2
+        if self._reached_at is None and near and np.linalg.norm(self._error()[3:]) < waypoint.turn_tolerance:
             self._reached_at = self._steps
         if self._reached_at is not None:
-            return self._steps - self._reached_at >= self._waypoint.dwell
-        self._stalled = self._stalled + 1 if moved @ moved < STALLED**2 else 0
+            return self._steps - self._reached_at >= waypoint.dwell
+        self._stalled = self._stalled + 1 if moved @ moved < STALLED**2 and not near else 0
         if self._steps < self._patience and self._stalled < STALLED_STEPS:
             return False
-        if self._waypoint.required:
+        if waypoint.required:
             self._skill = iter(())
         return True
 
@@ -82,9 +87,10 @@ class PlayPolicy:
             self._orientation = self._scene.env.target_pose.quaternion
         else:
             self._orientation = hand_orientation(waypoint.yaw, waypoint.tilt)
-        self._last_tcp = self._scene.tcp
-        distance = float(np.abs(waypoint.position - self._last_tcp).max())
-        self._patience = expected_steps(distance, waypoint.speed, self._scale[0]) + waypoint.patience
+        error = self._error()
+        if np.isinf(waypoint.turn_tolerance):
+            error[3:] = 0.0  # nobody waits for the turn
+        self._patience = expected_steps(error, self._scale, waypoint.speed) + waypoint.patience
         self._steps, self._stalled, self._reached_at = 0, 0, None
 
     def _next_skill(self) -> skills.Skill:

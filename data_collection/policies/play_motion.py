@@ -38,6 +38,7 @@ class Waypoint:
         gripper: 1 opens, -1 closes.
         speed: largest velocity along an axis, as a share of the action range; above 1 several axes are at their limit.
         tolerance: distance at which the waypoint counts as reached, metres.
+        turn_tolerance: angle at which it does, radians.
         dwell: control steps to stay after reaching it.
         noise: standard deviation of the velocity noise, as a share of the action range.
         patience: control steps beyond the expected duration after which it counts as missed.
@@ -50,6 +51,7 @@ class Waypoint:
     gripper: float = 1.0
     speed: float = 0.6
     tolerance: float = 0.02
+    turn_tolerance: float = np.inf
     dwell: int = 0
     noise: float = 0.15
     patience: int = 15
@@ -97,9 +99,9 @@ class Follower:
         return np.clip(action, -1.0, 1.0)
 
 
-def expected_steps(distance: float, speed: float, full_speed: float) -> int:
-    """Control steps that the follower takes over `distance`, m, at `speed`, a share of `full_speed`, m a step."""
-    return int(distance / (min(speed, 1.0) * full_speed)) + 8
+def expected_steps(error: Array, scale: Array, speed: float) -> int:
+    """Control steps that a follower of this scale (6,) takes over an error (6,) at this speed."""
+    return int(np.abs(error / scale).max() / min(speed, 1.0)) + 8
 
 
 def rotation_between(start: Array, end: Array) -> Array:

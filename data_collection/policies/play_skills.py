@@ -70,7 +70,7 @@ def carry(scene: Scene, rng: np.random.Generator, name: str) -> Skill:
         yield from push(scene, rng, name)
         return
     hold = partial(Waypoint, yaw=yaw, noise=0.02)
-    yield hold(block.position + _at(0, 0, CLEARANCE), speed=0.9, tolerance=0.015, required=True)
+    yield hold(block.position + _at(0, 0, CLEARANCE), speed=0.9, tolerance=0.015, turn_tolerance=0.12, required=True)
     grip = scene.block(name).position
     yield hold(grip, speed=0.6, tolerance=0.01, required=True)
     yield hold(grip, gripper=CLOSED, dwell=7)
@@ -136,7 +136,7 @@ def manipulation(scene: Scene, rng: np.random.Generator, thing: str) -> Skill:
 
 def _slide_by_grasp(scene: Scene, rng: np.random.Generator, fixture: str, out: Array) -> Skill:
     hold = partial(Waypoint, yaw=0.0, noise=0.03)
-    yield hold(scene.handle(fixture) + out, speed=0.9, tolerance=0.025, required=True)
+    yield hold(scene.handle(fixture) + out, speed=0.9, tolerance=0.025, turn_tolerance=0.15, required=True)
     yield hold(scene.handle(fixture), speed=0.7, tolerance=0.015, required=True)
     yield hold(scene.handle(fixture), gripper=CLOSED, dwell=6)
     yield hold(_slide_goal(scene, rng, fixture), gripper=CLOSED, speed=rng.uniform(0.3, 0.9), tolerance=0.015)
