@@ -24,7 +24,7 @@ from data_collection.policies.play_motion import (
 from data_collection.policies.play_scene import Scene
 from envs.tabletop.table import BLOCKS
 
-WEIGHTS = {"drawer": 1.7, "door": 1.2, "switch": 1.3, "button": 1.2} | dict.fromkeys(BLOCKS, 1.0)  # sooner or later
+WEIGHTS = {"drawer": 1.5, "door": 1.3, "switch": 1.1, "button": 1.1} | dict.fromkeys(BLOCKS, 1.2)  # sooner or later
 REACHES = (0.05, 0.5, 0.45)  # probability of 0, 1 and 2 reaches after a manipulation
 STALLED, STALLED_STEPS = 0.001, 10  # m a step, steps: a hand that does not get on any more
 
@@ -96,9 +96,11 @@ class PlayPolicy:
     def _next_skill(self) -> skills.Skill:
         if self._reaches > 0:
             self._reaches -= 1
-            return skills.reach(self._scene, self._rng)
-        if not self._things:
-            shares = np.array(list(WEIGHTS.values())) / sum(WEIGHTS.values())
-            self._things = list(self._rng.choice(list(WEIGHTS), len(WEIGHTS), replace=False, p=shares))
-        self._reaches = int(self._rng.choice(3, p=REACHES))
-        return skills.manipulation(self._scene, self._rng, self._things.pop(0))
+            skill = skills.reach(self._scene, self._rng)
+        else:
+            if not self._things:
+                shares = np.array(list(WEIGHTS.values())) / sum(WEIGHTS.values())
+                self._things = list(self._rng.choice(list(WEIGHTS), len(WEIGHTS), replace=False, p=shares))
+            self._reaches = int(self._rng.choice(3, p=REACHES))
+            skill = skills.manipulation(self._scene, self._rng, self._things.pop(0))
+        return skills.around_the_edge(self._scene, skill)

@@ -25,36 +25,36 @@ FINGER_HEIGHT = 0.014  # m, TCP over the table when the fingertips just clear it
 CLEARANCE = 0.07  # m over a block from which the hand moves sideways
 CABINET_FRONT = -0.07  # m; beyond this y the hand only fits with its fingers spread along x
 BUTTON_RADIUS = 0.075  # m, what a pushed block keeps away from
+WIDEST_GRASP = 0.032  # m, half of what fits between the fingers
+FINGERS = (-0.05, 0.05)  # m, where they are when open
 CARRY_SHARE = 0.6  # how often a block is carried, not pushed
 
 
 def reach(scene: Scene, rng: np.random.Generator) -> Skill:
     """Free movement through the whole workspace, in all directions, at all speeds."""
     yaw = float(rng.uniform(-0.6, 0.6)) if rng.random() < 0.5 else None
-    gripper, noise = rng.choice([OPEN, CLOSED]), rng.uniform(0.05, 0.25)
-    move = partial(Waypoint, yaw=yaw, tilt=rng.uniform(-0.2, 0.2, 2), gripper=gripper, tolerance=0.03, noise=noise)
+    tilt, gripper = rng.uniform(-0.2, 0.2, 2), rng.choice([OPEN, CLOSED])
     kind = rng.choice(["point", "along_view", "darts"], p=[0.5, 0.2, 0.3])
+    speed, wander = rng.uniform(0.3, 1.5), rng.uniform(0.1, 0.3)
+    move = partial(Waypoint, yaw=yaw, tilt=tilt, gripper=gripper, tolerance=0.03)
     if kind == "darts":
         for _ in range(rng.integers(3, 7)):
-            yield move(_nearby_point(scene, rng), speed=rng.uniform(0.6, 2.0))
+            yield move(_nearby_point(scene, rng), speed=rng.uniform(0.6, 2.0), noise=wander)
         return
     goal = _far_along_view(scene, rng) if kind == "along_view" else _random_point(scene, rng)
-    speed = rng.uniform(0.3, 1.5)
-    for corner in _over_the_edge(scene, goal):
-        yield move(corner, speed=speed)
-    yield move(goal, speed=speed)
+    yield move(goal, speed=speed, noise=wander * speed)
 
 
 def push(scene: Scene, rng: np.random.Generator, name: str) -> Skill:
     """Push a block over the table with the fingers."""
     block = scene.block(name)
-    way = _push_way(scene, rng, name) if _within_reach(block) else None
+    gripper = rng.choice([CLOSED, CLOSED, OPEN])
+    way = _push_way(scene, rng, name, room=0.03 if gripper == CLOSED else 0.07) if _within_reach(block) else None
     if way is None:
         return
     start, finish = way
     height = max(block.position[2], TABLE_TOP + FINGER_HEIGHT)
     over = block.position[2] + block.half_size[2] + CLEARANCE
-    gripper = rng.choice([CLOSED, CLOSED, OPEN])
     move = partial(Waypoint, yaw=rng.uniform(-0.4, 0.4), gripper=gripper, tolerance=0.012, noise=0.05)
     yield move(np.append(start, over), speed=0.9, tolerance=0.03, required=True)
     yield move(np.append(start, height), speed=0.7, required=True)
@@ -65,7 +65,7 @@ def push(scene: Scene, rng: np.random.Generator, name: str) -> Skill:
 def carry(scene: Scene, rng: np.random.Generator, name: str) -> Skill:
     """Grasp a block, lift it, carry it elsewhere, put it down or let it fall."""
     block = scene.block(name)
-    yaw = _grasp_yaw(block)
+    yaw = _grasp_yaw(scene, name) if _within_reach(block) else None
     if yaw is None:
         yield from push(scene, rng, name)
         return
@@ -92,8 +92,6 @@ def slide_drawer(scene: Scene, rng: np.random.Generator) -> Skill:
     behind = _at(0, 0.034, 0)  # between the bar of the handle and the drawer's front
     handle = scene.handle("drawer") + behind
     hook = partial(Waypoint, yaw=0.0, gripper=CLOSED, noise=0.03)
-    for corner in _over_the_edge(scene, handle):
-        yield hook(corner, speed=0.9, tolerance=0.04)
     yield hook(handle + _at(0, 0, 0.12), speed=0.9, tolerance=0.025, required=True)
     yield hook(scene.handle("drawer") + behind, speed=0.6, tolerance=0.012, required=True)
     yield hook(_slide_goal(scene, rng, "drawer") + behind, speed=rng.uniform(0.3, 0.9), noise=0.06, tolerance=0.015)
@@ -102,12 +100,12 @@ def slide_drawer(scene: Scene, rng: np.random.Generator) -> Skill:
 
 def slide_door(scene: Scene, rng: np.random.Generator) -> Skill:
     """Take the handle of the door between the fingers and slide it."""
-    yield from _slide_by_grasp(scene, rng, "door", out=_at(0, -0.05, 0.05))
+    yield from _slide_by_grasp(scene, rng, "door", out=_at(0, -0.06, 0.05), tilt=0.55)
 
 
 def move_switch(scene: Scene, rng: np.random.Generator) -> Skill:
     """Take the lever of the switch between the fingers and move it along its slot."""
-    yield from _slide_by_grasp(scene, rng, "switch", out=_at(0, -0.06, 0.06))
+    yield from _slide_by_grasp(scene, rng, "switch", out=_at(0, -0.06, 0.06), tilt=0.2)
 
 
 def press_button(scene: Scene, rng: np.random.Generator) -> Skill:
@@ -134,8 +132,20 @@ def manipulation(scene: Scene, rng: np.random.Generator, thing: str) -> Skill:
     return FIXTURE_SKILLS[thing](scene, rng)
 
 
-def _slide_by_grasp(scene: Scene, rng: np.random.Generator, fixture: str, out: Array) -> Skill:
-    hold = partial(Waypoint, yaw=0.0, noise=0.03)
+def around_the_edge(scene: Scene, skill: Skill) -> Skill:
+    """The same skill, with a detour wherever the front edge of the table, or an open drawer, would be in the way."""
+    for waypoint in skill:
+        start, goal = scene.tcp, waypoint.position
+        low, high = (start, goal) if start[1] < goal[1] else (goal, start)
+        if low[1] < TABLE_EDGE < high[1] and low[2] < TABLE_TOP + 0.03:
+            corner = _at(low[0], TABLE_EDGE - 0.06, TABLE_TOP + 0.08)
+            yield Waypoint(corner, gripper=waypoint.gripper, speed=waypoint.speed, tolerance=0.04)
+        yield waypoint
+
+
+def _slide_by_grasp(scene: Scene, rng: np.random.Generator, fixture: str, out: Array, tilt: float) -> Skill:
+    """`out` (3,) is the way the hand comes from; tilted fingers point into the cabinet and keep the palm off it."""
+    hold = partial(Waypoint, yaw=0.0, tilt=(tilt, 0.0), noise=0.03)
     yield hold(scene.handle(fixture) + out, speed=0.9, tolerance=0.025, turn_tolerance=0.15, required=True)
     yield hold(scene.handle(fixture), speed=0.7, tolerance=0.015, required=True)
     yield hold(scene.handle(fixture), gripper=CLOSED, dwell=6)
@@ -184,31 +194,23 @@ def _free_steps(scene: Scene, step: Array) -> int:
     return count
 
 
-def _over_the_edge(scene: Scene, goal: Array) -> list[Array]:
-    """Corners on the way to a goal when the table's front edge is in between."""
-    start = scene.tcp
-    low, high = (start, goal) if start[1] < goal[1] else (goal, start)
-    if low[1] < TABLE_EDGE < high[1] and low[2] < TABLE_TOP + 0.03:
-        return [_at(low[0], TABLE_EDGE - 0.06, TABLE_TOP + 0.08)]
-    return []
+def _push_way(scene: Scene, rng: np.random.Generator, name: str, room: float) -> tuple[Array, Array] | None:
+    """Where on the table, (2,) each, the fingers come down behind a block and where they stop; None if nowhere.
 
-
-def _push_way(scene: Scene, rng: np.random.Generator, name: str) -> tuple[Array, Array] | None:
-    """Where on the table, (2,) each, the fingers come down behind a block and where they stop; None if nowhere."""
+    `room` is what they need beside the block, metres.
+    """
     block = scene.block(name)
     button = scene.handle("button")[:2]
-    others = [scene.block(other).position[:2] for other in BLOCKS if other != name]
     for _ in range(12):
         way = rng.uniform(TABLE_LOW, TABLE_HIGH) - block.position[:2]
         length = float(np.linalg.norm(way))
         if length < 0.06:
             continue
         way *= min(length, 0.25) / length
-        start = block.position[:2] - way / np.linalg.norm(way) * (np.linalg.norm(block.half_size[:2]) + 0.03)
+        start = block.position[:2] - way / np.linalg.norm(way) * (np.linalg.norm(block.half_size[:2]) + room)
         finish = block.position[:2] + way
         inside = (start > START_LOW).all() and (start < START_HIGH).all()
-        blocked = min(np.linalg.norm(other - start) for other in others) < 0.06
-        if inside and not blocked and _distance_to_segment(button, start, finish) > BUTTON_RADIUS:
+        if inside and _clear(scene, start, name) and _distance_to_segment(button, start, finish) > BUTTON_RADIUS:
             return start, finish
     return None
 
@@ -223,18 +225,24 @@ def _within_reach(block: Block) -> bool:
     return bool(abs(x) < 0.40 and -0.22 < y < 0.03 and TABLE_TOP < z < TABLE_TOP + 0.2)
 
 
-def _grasp_yaw(block: Block) -> float | None:
+def _grasp_yaw(scene: Scene, name: str) -> float | None:
     """Yaw at which the fingers close over the block; None where the hand does not fit."""
-    if not _within_reach(block):
-        return None
+    block = scene.block(name)
     for axis in np.argsort(block.half_size):
         direction = block.rotation[:, axis]
-        if block.half_size[axis] < 0.032 and abs(direction[2]) < 0.2:
-            yaw = float(np.arctan2(direction[1], direction[0]))
-            yaw = (yaw + np.pi / 2) % np.pi - np.pi / 2  # the hand is symmetric
-            if block.position[1] < CABINET_FRONT or abs(yaw) < 0.45:
-                return yaw
+        if block.half_size[axis] > WIDEST_GRASP or abs(direction[2]) > 0.2:
+            continue
+        yaw = float(np.arctan2(direction[1], direction[0]))
+        yaw = (yaw + np.pi / 2) % np.pi - np.pi / 2  # the hand is symmetric
+        fits = block.position[1] < CABINET_FRONT or abs(yaw) < 0.45
+        if fits and all(_clear(scene, block.position[:2] + side * direction[:2], name) for side in FINGERS):
+            return yaw
     return None
+
+
+def _clear(scene: Scene, place: Array, name: str) -> bool:
+    """Whether a place (2,) on the table is clear of the blocks other than `name`."""
+    return all(np.linalg.norm(scene.block(other).position[:2] - place) > 0.055 for other in BLOCKS if other != name)
 
 
 def _at(x: float, y: float, z: float) -> Array:
