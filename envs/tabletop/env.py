@@ -225,11 +225,9 @@ class TabletopEnv(gymnasium.Env):
 
     def scene_obs(self) -> NDArray[np.float64]:
         """CALVIN's scene observation (24,): fixtures, lamps, then position (m) and Euler angles (rad) of the blocks."""
-        values = [self._fixture(name) for name in FIXTURES] + [float(self.bulb_on), float(self.led_on)]
-        for name in table.BLOCKS:
-            pose = self.mj_data.joint(name).qpos
-            values += [*pose[:3], *rotations.to_euler(pose[3:])]
-        return np.array(values)
+        blocks = self.mj_data.qpos[self._block_qpos]  # (3, 7)
+        poses = np.concatenate([blocks[:, :3], rotations.to_euler(blocks[:, 3:])], axis=1)
+        return np.concatenate([self.mj_data.qpos[self._fixture_qpos], [self.bulb_on, self.led_on], poses.ravel()])
 
     # --- Inside ----------------------------------------------------------------------------------------------------
 
@@ -241,6 +239,8 @@ class TabletopEnv(gymnasium.Env):
         self._target_dofs = slice(target.dofadr[0], target.dofadr[0] + 6)
         self._finger_qpos = [int(finger.qposadr[0]) for finger in fingers]
         self._finger_ctrl = [model.actuator(f"gripper_{name}").id for name in FINGER_JOINTS]
+        self._fixture_qpos = [int(model.joint(name).qposadr[0]) for name in FIXTURES]
+        self._block_qpos = np.array([model.joint(name).qposadr[0] + np.arange(7) for name in table.BLOCKS])
         self._lamps = {name: model.geom(name).id for name in ("led", "bulb")}
 
     def _make_observation_space(self) -> gymnasium.spaces.Dict:
@@ -293,7 +293,7 @@ class TabletopEnv(gymnasium.Env):
         return self._picture
 
     def _fixture(self, name: str) -> float:
-        return float(self.mj_data.joint(name).qpos[0])
+        return float(self.mj_data.qpos[self._fixture_qpos[FIXTURES.index(name)]])
 
     def _proprioception(self) -> NDArray[np.float32]:
         tcp, fingers = self.tcp_pose, self.mj_data.qpos[self._finger_qpos]

@@ -25,11 +25,11 @@ FINGER_JOINTS = ("finger_joint1", "finger_joint2")
 FINGER_TRAVEL = 0.04  # m, each finger
 REST_ARM = (-1.218, 1.040, 2.120, -2.342, -0.870, 1.641, 0.553)  # rad, CALVIN's
 
-FORCE_LIMIT = 300.0  # N along each axis of the target
-TORQUE_LIMIT = 40.0  # N m about each axis of the target
-STIFFNESS, DAMPING = 60_000.0, 1_100.0  # N/m, N s/m
-ROTATION_STIFFNESS, ROTATION_DAMPING = 1_500.0, 30.0  # N m/rad, N m s/rad
-POSTURE_STIFFNESS, JOINT_DAMPING, JOINT_ARMATURE = 4.0, 4.0, 0.1  # N m/rad, N m s/rad, kg m^2
+FORCE_LIMIT = 500.0  # N along each axis of the target
+TORQUE_LIMIT = 80.0  # N m about each axis of the target
+STIFFNESS, DAMPING = 70_000.0, 1_000.0  # N/m, N s/m; more damping jerks blocks out of the fingers
+ROTATION_STIFFNESS, ROTATION_DAMPING = 3_000.0, 60.0  # N m/rad, N m s/rad
+POSTURE_STIFFNESS, JOINT_DAMPING, JOINT_ARMATURE = 4.0, 4.0, 0.03  # N m/rad, N m s/rad, kg m^2
 INERTIA_SCALE = 0.1  # robosuite's moments of inertia are some ten times those of the real links
 TARGET_MASS = 1e6  # kg; the hand's pull moves it by nanometres
 

@@ -7,12 +7,17 @@ import numpy as np
 
 from envs.tabletop import robot, table
 from envs.tabletop.layouts import layout
-from envs.tabletop.textures import add_wood
+from envs.tabletop.textures import add_textured_material, add_wood
 
-TIMESTEP, SUBSTEPS = 1 / 480, 16
-CONTROL_RATE = 30  # Hz
+CONTROL_RATE, SUBSTEPS = 30, 8  # Hz, physics steps in a control step; CALVIN's
+TIMESTEP = 1 / (CONTROL_RATE * SUBSTEPS)  # s
 
-STATIC_CAMERA = {"fovy": 10.0, "eye": (2.871, -2.167, 2.555), "target": (-0.026, -0.030, 0.392), "up": (0.404, 0.226, 0.886)}
+STATIC_CAMERA = {
+    "fovy": 10.0,
+    "eye": (2.871, -2.167, 2.555),
+    "target": (-0.026, -0.030, 0.392),
+    "up": (0.404, 0.226, 0.886),
+}
 SIDE_CAMERA = {"fovy": 24.0, "eye": (-1.05, -2.35, 1.75), "target": (-0.04, -0.12, 0.42), "up": (0.0, 0.0, 1.0)}
 STATIC_DEPTH_RANGE = (3.7, 6.3)  # m, CALVIN's
 SIDE_DEPTH_RANGE = (1.6, 6.0)  # m
@@ -32,8 +37,9 @@ def build_model(scene: str) -> mujoco.MjModel:
     spec.attach(robot.panda(), prefix="", frame=mount)
     for body in spec.bodies:
         for geom in body.geoms:
-            if geom.group == 0 and body.name in robot.COLLIDING_LINKS or body.name.endswith("_tip"):
-                geom.contype, geom.conaffinity, geom.group = table.ROBOT, table.HITS[table.ROBOT], 3
+            if (geom.group == 0 and body.name in robot.COLLIDING_LINKS) or body.name.endswith("_tip"):
+                table.set_contacts(geom, table.ROBOT)
+                geom.group = 3
     robot.add_target(spec)
     return spec.compile()
 
@@ -48,10 +54,13 @@ def _set_options(spec: mujoco.MjSpec) -> None:
     spec.visual.map.znear, spec.visual.map.zfar = 1.5, 8.0
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.42] * 3, [0.25] * 3
     spec.visual.headlight.specular = [0.0] * 3
-    spec.visual.quality.offsamples = 0
+    quality = spec.visual.quality  # cost is per triangle: boxes need one quad a face
+    quality.offsamples, quality.numquads, quality.numslices, quality.numstacks = 0, 1, 16, 8
 
 
 def _add_surroundings(spec: mujoco.MjSpec) -> None:
+    sky = {"type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mujoco.mjtBuiltin.mjBUILTIN_GRADIENT}
+    spec.add_texture(name="sky", rgb1=[0.80, 0.83, 0.86], rgb2=[0.62, 0.64, 0.66], width=16, height=96, **sky)
     spec.add_texture(
         name="floor",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -61,10 +70,10 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
         width=64,
         height=64,
     )
-    textures = [""] * mujoco.mjtTextureRole.mjNTEXROLE
-    textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
-    spec.add_material(name="floor", textures=textures, texrepeat=[6, 6])
-    floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2.4, 2.4, 0.1], material="floor")
+    add_textured_material(spec, "floor", "floor", repeat=6)
+    floor = spec.worldbody.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2.4, 2.4, 0.1], material="floor"
+    )
     floor.contype, floor.conaffinity, floor.group = table.STATIC, table.HITS[table.STATIC], table.VISIBLE
     foot_height = robot.BASE_POSITION[2] / 2
     foot = spec.worldbody.add_geom(name="pedestal", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.1, foot_height, 0])

@@ -22,16 +22,20 @@ BLOCK_SIDE, BLOCK_MASS = 0.04, 0.25  # m, kg
 
 DRAWER_TRAVEL, BUTTON_TRAVEL, SWITCH_TRAVEL = 0.22, 0.02, 0.088  # m
 FIXTURE_FRICTION = 4.0  # N, as in CALVIN
+FIXTURE_ARMATURE = 1.0  # kg; MuJoCo's contacts and limits are as stiff as what they hold is heavy
 SLOPE_FOOT = np.array([0.0, 0.03, TOP])  # the cabinet's front plane meets the table here
 SLOPE_UP = np.array([0.0, 0.5, np.sqrt(0.75)])  # along the plane, upwards
 SLOPE_OUT = np.array([0.0, -np.sqrt(0.75), 0.5])  # its normal, towards the robot
 SLOPE_QUAT = [np.cos(np.pi / 6), np.sin(np.pi / 6), 0.0, 0.0]  # local x, y, z = x, SLOPE_UP, SLOPE_OUT
+UPRIGHT_QUAT = [np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]  # local x, y, z = x, z, -y
 SLOPE_HEIGHT = 0.21  # m along SLOPE_UP
 CABINET_TOP = 0.625  # m
 
 VISIBLE = 1  # geom group
 STATIC, BLOCK, FIXTURE, ROBOT = 1, 2, 4, 8  # contact classes
 HITS = {STATIC: BLOCK | ROBOT, FIXTURE: BLOCK | ROBOT, BLOCK: BLOCK | ROBOT, ROBOT: 0}
+
+STIFF_SOLREF, STIFF_SOLIMP = [0.009, 1], [0.95, 0.99, 0.001, 0.5, 2]  # twice the time step is the least
 
 METAL = (0.75, 0.76, 0.78, 1)
 SHADOW = (0.12, 0.12, 0.13, 1)
@@ -86,7 +90,7 @@ def _add_drawer(table: mujoco.MjsBody, layout: Layout) -> None:
     drawer = table.add_body(name="drawer", pos=[layout.drawer_x, -HALF_DEPTH, 0.32], gravcomp=1)
     _joint(drawer, "drawer", [0, -1, 0], DRAWER_TRAVEL, damping=8)
     wall, depth, height = 0.01, 0.28, 0.10
-    front = _box(drawer, FIXTURE, [0, -0.006, 0.01], [0.28, 0.016, 0.13], material="door", mass=0.4)
+    front = _box(drawer, FIXTURE, [0, -0.006, 0.01], [0.28, 0.13, 0.016], quat=UPRIGHT_QUAT, material="door", mass=0.4)
     front.name = "drawer_front"
     _box(drawer, FIXTURE, [0, depth / 2, -0.055], [0.26, depth, wall], material="body", mass=0.2)
     _box(drawer, FIXTURE, [0, depth - wall / 2, -0.01], [0.26, wall, height - 0.02], material="body", mass=0.1)
@@ -157,18 +161,27 @@ def _joint(
     body: mujoco.MjsBody, name: str, axis: Sequence[float], travel: float, damping: float, friction=FIXTURE_FRICTION
 ) -> mujoco.MjsJoint:
     joint = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis, range=[0, travel])
-    joint.limited, joint.frictionloss, joint.damping, joint.armature = True, friction, [damping, 0, 0], 0.05
+    joint.limited, joint.solref_limit, joint.solimp_limit = True, STIFF_SOLREF, STIFF_SOLIMP
+    joint.frictionloss, joint.damping, joint.armature = friction, [damping, 0, 0], FIXTURE_ARMATURE
     return joint
 
 
 def _span(table: mujoco.MjsBody, x: Sequence[float], y: Sequence[float], z: Sequence[float], **look) -> None:
-    """An upright static box between two coordinates on each axis."""
+    """An upright static box between two coordinates on each axis; the wood shows on its top or front, the larger."""
     low, high = np.array([x, y, z], np.float64).T
-    if (high > low).all():
-        _box(table, STATIC, (low + high) / 2, high - low, **({"material": "body"} | look))
+    middle, sides = (low + high) / 2, high - low
+    if (sides <= 0).any():
+        return
+    look = {"material": "body"} | look
+    if sides[2] > sides[1]:
+        _box(table, STATIC, middle, sides[[0, 2, 1]], quat=UPRIGHT_QUAT, **look)
+    else:
+        _box(table, STATIC, middle, sides, **look)
 
 
-def _slope_box(body: mujoco.MjsBody, contact: int, x: Sequence[float], up: Sequence[float], out: Sequence[float], **look):
+def _slope_box(
+    body: mujoco.MjsBody, contact: int, x: Sequence[float], up: Sequence[float], out: Sequence[float], **look
+):
     """A box in the cabinet's front plane: spans of x, along the slope, and out of it."""
     low, high = np.array([x, up, out], np.float64).T
     if (high > low).all():
@@ -184,5 +197,12 @@ def _box(body: mujoco.MjsBody, contact: int, place, sides, **look) -> mujoco.Mjs
 
 
 def _contacts(geom: mujoco.MjsGeom, contact: int) -> None:
-    geom.group, geom.contype, geom.conaffinity = VISIBLE, contact, HITS[contact]
+    geom.group = VISIBLE
+    set_contacts(geom, contact)
     geom.friction = [0.7, 0.005, 0.0001]
+
+
+def set_contacts(geom: mujoco.MjsGeom, contact: int) -> None:
+    """Let `geom` collide as one of the classes STATIC, BLOCK, FIXTURE, ROBOT."""
+    geom.contype, geom.conaffinity = contact, HITS[contact]
+    geom.solref, geom.solimp = STIFF_SOLREF, STIFF_SOLIMP

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from envs.tabletop.layouts import Wood
 
-SIZE = 128  # px, each face of a cube texture
+SIZE = 128  # px
 
 
 def wood_image(wood: Wood) -> NDArray[np.uint8]:
@@ -32,12 +32,16 @@ def wood_image(wood: Wood) -> NDArray[np.uint8]:
 
 
 def add_wood(spec: mujoco.MjSpec, name: str, wood: Wood) -> None:
-    """Add the material `name`, which shows the wood on every face of a box."""
-    image = wood_image(wood)
+    """Add the material `name`: the wood seen along a geom's local z axis, its grain along y."""
     texture = spec.add_texture(
-        name=name, type=mujoco.mjtTexture.mjTEXTURE_CUBE, width=SIZE, height=6 * SIZE, nchannel=3
-    )
-    texture.data = np.tile(image, (6, 1, 1)).tobytes()
+        name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=SIZE, height=SIZE, nchannel=3
+    )  # a cube texture would show on every face, at twice the cost of a pixel in software
+    texture.data = wood_image(wood).tobytes()
+    add_textured_material(spec, name, name)
+
+
+def add_textured_material(spec: mujoco.MjSpec, name: str, texture: str, repeat: int = 1) -> None:
+    """Add the material `name` that shows `texture`."""
     textures = [""] * mujoco.mjtTextureRole.mjNTEXROLE
-    textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
-    spec.add_material(name=name, textures=textures, specular=0.1, shininess=0.1)
+    textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = texture
+    spec.add_material(name=name, textures=textures, texrepeat=[repeat, repeat], specular=0.1, shininess=0.1)
