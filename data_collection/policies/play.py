@@ -24,8 +24,8 @@ from data_collection.policies.play_motion import (
 from data_collection.policies.play_scene import Scene
 from envs.tabletop.table import BLOCKS
 
-WEIGHTS = {"drawer": 1.5, "door": 1.3, "switch": 1.1, "button": 1.1} | dict.fromkeys(BLOCKS, 1.2)  # sooner or later
-REACHES = (0.05, 0.5, 0.45)  # probability of 0, 1 and 2 reaches after a manipulation
+WEIGHTS = {"drawer": 1.3, "door": 1.4, "switch": 1.2, "button": 0.9} | dict.fromkeys(BLOCKS, 1.2)  # sooner or later
+REACHES = (0.1, 0.55, 0.35)  # probability of 0, 1 and 2 reaches after a manipulation
 STALLED, STALLED_STEPS = 0.001, 10  # m a step, steps: a hand that does not get on any more
 
 

@@ -34,7 +34,7 @@ def reach(scene: Scene, rng: np.random.Generator) -> Skill:
     """Free movement through the whole workspace, in all directions, at all speeds."""
     yaw = float(rng.uniform(-0.6, 0.6)) if rng.random() < 0.5 else None
     tilt, gripper = rng.uniform(-0.2, 0.2, 2), rng.choice([OPEN, CLOSED])
-    kind = rng.choice(["point", "along_view", "darts"], p=[0.5, 0.2, 0.3])
+    kind = rng.choice(["point", "along_view", "darts"], p=[0.4, 0.2, 0.4])
     speed, wander = rng.uniform(0.3, 1.5), rng.uniform(0.1, 0.3)
     move = partial(Waypoint, yaw=yaw, tilt=tilt, gripper=gripper, tolerance=0.03)
     if kind == "darts":
@@ -74,7 +74,7 @@ def carry(scene: Scene, rng: np.random.Generator, name: str) -> Skill:
     grip = scene.block(name).position
     yield hold(grip, speed=0.6, tolerance=0.01, required=True)
     yield hold(grip, gripper=CLOSED, dwell=7)
-    height = grip[2] + rng.uniform(0.06, 0.25)
+    height = grip[2] + rng.uniform(0.06, 0.35)
     carried = partial(Waypoint, gripper=CLOSED, noise=0.08, speed=rng.uniform(0.4, 1.0))
     yield carried(np.append(grip[:2], height), yaw=yaw, tolerance=0.05)
     if scene.block(name).position[2] < grip[2] + 0.01:
@@ -170,10 +170,10 @@ def _random_point(scene: Scene, rng: np.random.Generator) -> Array:
 
 
 def _nearby_point(scene: Scene, rng: np.random.Generator) -> Array:
-    """A free point 6 to 25 cm away in any direction."""
+    """A free point 6 to 35 cm away in any direction."""
     for _ in range(20):
         direction = rng.normal(size=3)
-        point = scene.tcp + direction / np.linalg.norm(direction) * rng.uniform(0.06, 0.25)
+        point = scene.tcp + direction / np.linalg.norm(direction) * rng.uniform(0.06, 0.35)
         if scene.free(point):
             return point
     return _random_point(scene, rng)
