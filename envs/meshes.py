@@ -7,6 +7,7 @@ faster. Only what is drawn is touched, never a mesh that collides.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 import tempfile
 from collections.abc import Sequence
@@ -95,7 +96,7 @@ def _read_obj(path: Path) -> tuple[NDArray, NDArray]:
         elif kind == "f":
             corners = [int(field.split("/")[0]) for field in fields]
             corners = [corner - 1 if corner > 0 else len(vertices) + corner for corner in corners]
-            faces += [[corners[0], a, b] for a, b in zip(corners[1:], corners[2:], strict=False)]
+            faces += [[corners[0], a, b] for a, b in itertools.pairwise(corners[1:])]
     return np.array(vertices, np.float64), np.array(faces, np.int64)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import mujoco
@@ -44,7 +44,7 @@ class TabletopEnv(gymnasium.Env):
         images: whether observations hold `rgb` and `depth`; without them no OpenGL is needed.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": CONTROL_RATE}
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": CONTROL_RATE}  # noqa: RUF012
     ACTION_AGGREGATION = control.ACTION_AGGREGATION
     ACTION_SCALE = control.ACTION_SCALE
     control_rate = CONTROL_RATE
@@ -153,7 +153,7 @@ class TabletopEnv(gymnasium.Env):
     @property
     def target_pose(self) -> Pose:
         """The pose that the hand is pulled to."""
-        qpos = self.mj_data.qpos[self._target_qpos]
+        qpos = self.mj_data.qpos[self.target_qpos]
         return Pose(qpos[:3].copy(), qpos[3:].copy())
 
     @property
@@ -178,7 +178,7 @@ class TabletopEnv(gymnasium.Env):
 
     def observation(self) -> dict[str, NDArray]:
         """The current observation."""
-        observation = {"proprio": self._proprioception()}
+        observation: dict[str, NDArray] = {"proprio": self._proprioception()}
         if self.images:
             rgb, depth = self._look()
             observation = {"rgb": rgb.copy(), "depth": depth.copy(), **observation}
@@ -235,10 +235,10 @@ class TabletopEnv(gymnasium.Env):
         model = self.mj_model
         self._tcp_site = model.site("tcp").id
         target, fingers = model.joint("target"), [model.joint(name) for name in FINGER_JOINTS]
-        self._target_qpos = slice(target.qposadr[0], target.qposadr[0] + 7)
-        self._target_dofs = slice(target.dofadr[0], target.dofadr[0] + 6)
+        self.target_qpos = slice(target.qposadr[0], target.qposadr[0] + 7)
+        self.target_dofs = slice(target.dofadr[0], target.dofadr[0] + 6)
         self._finger_qpos = [int(finger.qposadr[0]) for finger in fingers]
-        self._finger_ctrl = [model.actuator(f"gripper_{name}").id for name in FINGER_JOINTS]
+        self.finger_ctrl = [model.actuator(f"gripper_{name}").id for name in FINGER_JOINTS]
         self._fixture_qpos = [int(model.joint(name).qposadr[0]) for name in FIXTURES]
         self._block_qpos = np.array([model.joint(name).qposadr[0] + np.arange(7) for name in table.BLOCKS])
         self._lamps = {name: model.geom(name).id for name in ("led", "bulb")}
@@ -270,11 +270,11 @@ class TabletopEnv(gymnasium.Env):
             placement.place_arm(self.mj_model, self.mj_data, self.kinematics, rng)
 
     def _set_target(self, pose: Pose, velocity: NDArray[np.float64]) -> None:
-        self.mj_data.qpos[self._target_qpos] = np.concatenate([pose.position, pose.quaternion])
-        self.mj_data.qvel[self._target_dofs] = velocity
+        self.mj_data.qpos[self.target_qpos] = np.concatenate([pose.position, pose.quaternion])
+        self.mj_data.qvel[self.target_dofs] = velocity
 
     def _command_gripper(self, command: float) -> None:
-        self.mj_data.ctrl[self._finger_ctrl] = control.finger_targets(command)
+        self.mj_data.ctrl[self.finger_ctrl] = control.finger_targets(command)
 
     def _after_physics(self) -> None:
         """Bring what is seen up to date with the state; leaves the state itself alone."""
@@ -298,7 +298,7 @@ class TabletopEnv(gymnasium.Env):
     def _proprioception(self) -> NDArray[np.float32]:
         tcp, fingers = self.tcp_pose, self.mj_data.qpos[self._finger_qpos]
         joints = self.mj_data.qpos[self.kinematics.qpos_index]
-        last_gripper = 1.0 if self.mj_data.ctrl[self._finger_ctrl[0]] > 0 else -1.0
+        last_gripper = 1.0 if self.mj_data.ctrl[self.finger_ctrl[0]] > 0 else -1.0
         width = fingers[0] - fingers[1]
         values = [tcp.position, rotations.to_euler(tcp.quaternion), [width], joints, [last_gripper]]
         return np.concatenate(values).astype(np.float32)

@@ -16,7 +16,7 @@ STATIC_CAMERA = {
     "fovy": 10.0,
     "eye": (2.871, -2.167, 2.555),
     "target": (-0.026, -0.030, 0.392),
-    "up": (0.404, 0.226, 0.886),
+    "up": (0.404, 0.226, 0.886),  # CALVIN's; not upright, its pictures lean
 }
 SIDE_CAMERA = {"fovy": 24.0, "eye": (-1.05, -2.35, 1.75), "target": (-0.04, -0.12, 0.42), "up": (0.0, 0.0, 1.0)}
 STATIC_DEPTH_RANGE = (3.7, 6.3)  # m, CALVIN's
@@ -39,7 +39,7 @@ def build_model(scene: str) -> mujoco.MjModel:
         for geom in body.geoms:
             if (geom.group == 0 and body.name in robot.COLLIDING_LINKS) or body.name.endswith("_tip"):
                 table.set_contacts(geom, table.ROBOT)
-                geom.group = 3
+                geom.group, geom.condim = 3, 4  # torsional friction: a held block does not swing
     robot.add_target(spec)
     return spec.compile()
 

@@ -58,7 +58,7 @@ def add_table(spec: mujoco.MjSpec, layout: Layout) -> None:
         block.add_freejoint(name=name)
         sides = [length, BLOCK_SIDE, BLOCK_SIDE]
         geom = _box(block, BLOCK, [0, 0, 0], sides, rgba=rgba, name=name)
-        geom.mass, geom.condim, geom.friction = BLOCK_MASS, 4, [0.7, 0.005, 0.0001]
+        geom.mass = BLOCK_MASS
 
 
 def _add_body(table: mujoco.MjsBody, layout: Layout) -> None:
@@ -78,7 +78,7 @@ def _add_cabinet(table: mujoco.MjsBody, layout: Layout) -> None:
     _span(table, (-HALF_WIDTH, HALF_WIDTH), (HALF_DEPTH - BOARD, HALF_DEPTH), (TOP, CABINET_TOP))
     _span(table, (-HALF_WIDTH, HALF_WIDTH), (0.13, HALF_DEPTH), (CABINET_TOP, CABINET_TOP + BOARD))
     for start, end in ((-HALF_WIDTH, left), (right, HALF_WIDTH)):
-        _slope_box(table, STATIC, (start, end), (0, SLOPE_HEIGHT), (-BOARD, 0), material="body")
+        _slope_box(table, (start, end), (0, SLOPE_HEIGHT), (-BOARD, 0), material="body")
         edge = end - BOARD if start < 0 and end == left else start
         _span(table, (edge, edge + BOARD), (0.09, HALF_DEPTH), (TOP, CABINET_TOP))
     for end in (-HALF_WIDTH, HALF_WIDTH - BOARD):
@@ -104,7 +104,7 @@ def _add_drawer(table: mujoco.MjsBody, layout: Layout) -> None:
 
 def _add_door(table: mujoco.MjsBody, layout: Layout) -> None:
     """A panel one compartment wide; the handle stands out of its left edge."""
-    foot = SLOPE_FOOT + [layout.door_x, 0, 0]
+    foot = SLOPE_FOOT + np.array([layout.door_x, 0, 0])
     door = table.add_body(name="door", pos=foot, quat=SLOPE_QUAT, gravcomp=1)  # y along the slope, z out of it
     _joint(door, "door", [-1, 0, 0], layout.door_travel, damping=8)
     width, middle = layout.door_travel, SLOPE_HEIGHT / 2
@@ -132,8 +132,8 @@ def _add_switch(table: mujoco.MjsBody, layout: Layout) -> None:
     start = 0.063  # m along the slope, CALVIN's resting place
     slot = (start - 0.02, start + SWITCH_TRAVEL + 0.02)
     x = layout.switch_x
-    _slope_box(table, STATIC, (x - 0.022, x + 0.022), slot, (0, 0.002), rgba=SHADOW)
-    foot = SLOPE_FOOT + [x, 0, 0] + start * SLOPE_UP
+    _slope_box(table, (x - 0.022, x + 0.022), slot, (0, 0.002), rgba=SHADOW)
+    foot = SLOPE_FOOT + np.array([x, 0, 0]) + start * SLOPE_UP
     switch = table.add_body(name="switch", pos=foot, quat=SLOPE_QUAT, gravcomp=1)
     _joint(switch, "switch", [0, 1, 0], SWITCH_TRAVEL, damping=8)
     _box(switch, FIXTURE, [0, 0, 0.03], [0.03, 0.02, 0.056], rgba=METAL, mass=0.1, name="switch_lever")
@@ -179,15 +179,13 @@ def _span(table: mujoco.MjsBody, x: Sequence[float], y: Sequence[float], z: Sequ
         _box(table, STATIC, middle, sides, **look)
 
 
-def _slope_box(
-    body: mujoco.MjsBody, contact: int, x: Sequence[float], up: Sequence[float], out: Sequence[float], **look
-):
+def _slope_box(table: mujoco.MjsBody, x: Sequence[float], up: Sequence[float], out: Sequence[float], **look) -> None:
     """A box in the cabinet's front plane: spans of x, along the slope, and out of it."""
     low, high = np.array([x, up, out], np.float64).T
     if (high > low).all():
         middle = (low + high) / 2
-        place = SLOPE_FOOT + [middle[0], 0, 0] + middle[1] * SLOPE_UP + middle[2] * SLOPE_OUT
-        _box(body, contact, place, high - low, quat=SLOPE_QUAT, **look)
+        place = SLOPE_FOOT + np.array([middle[0], 0, 0]) + middle[1] * SLOPE_UP + middle[2] * SLOPE_OUT
+        _box(table, STATIC, place, high - low, quat=SLOPE_QUAT, **look)
 
 
 def _box(body: mujoco.MjsBody, contact: int, place, sides, **look) -> mujoco.MjsGeom:
