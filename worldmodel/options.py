@@ -85,8 +85,6 @@ class TrainOptions:
     """Decides weights, clips and noise."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """What the network runs in; geometry, splatting and losses always run in float32."""
-    compile: bool = True
-    """Compile the network, where there is a compiler."""
     device: str = "auto"
     """`cpu`, `cuda`, or `auto` for a GPU where there is one."""
     validate_every: int = 2000
@@ -120,8 +118,9 @@ PRESETS: dict[str, TrainOptions] = {
         _ANYWHERE,
         "cpu",
         architecture=ModelConfig(width=0.5, lstm_kernel=3),
-        steps=5000,
-        validate_every=500,
+        schedule=replace(Schedule(), clip_lengths=((0.45, 4), (0.8, 8), (1.0, 12))),
+        steps=2600,
+        validate_every=400,
         save_every=100,
         precision="bfloat16",
     ),
@@ -137,6 +136,5 @@ PRESETS: dict[str, TrainOptions] = {
         validation_clips=4,
         save_every=5,
         log_every=1,
-        compile=False,
     ),
 }

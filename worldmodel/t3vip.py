@@ -11,7 +11,6 @@ Where this departs from the paper or from its public code, and why:
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,7 +113,9 @@ class T3VIP(nn.Module):
         self.camera = CameraModel.from_json(context.camera)
         height, width = self.camera.height, self.camera.width
         if height % STRIDE or width % STRIDE:
-            raise ValueError(f"image size {height}x{width} is no multiple of {STRIDE}; choose another image size")
+            raise UsageError(
+                f"image size {height}x{width} is no multiple of {STRIDE}; collect pictures whose sides are"
+            )
         self.action_dim = context.action_dim if config.act_cond else 0
         self.latent_channels = 0 if config.latents == "none" else 1
         self.encoder = Encoder(4, self.action_dim, self.latent_channels, config.width, config.lstm_kernel)
@@ -131,7 +132,6 @@ class T3VIP(nn.Module):
         self.register_buffer("grid", geometry.pixel_grid(height, width), persistent=False)
         self.register_buffer("action_mean", torch.tensor(context.action_mean), persistent=False)
         self.register_buffer("action_std", torch.tensor(context.action_std), persistent=False)
-        self.fast_network: Callable[..., tuple[Tensor, Tensor, Tensor, Tensor, Memory]] | None = None
 
     @property
     def device(self) -> torch.device:
@@ -204,8 +204,7 @@ class T3VIP(nn.Module):
         if self.latent_channels and latent is None:
             latent = rgb.new_zeros((batch, *self.latent_shape))
 
-        network = self.fast_network if self.training and self.fast_network is not None else self.network
-        logits, painted, rotation, translation, memory = network(frame, action, latent, memory)
+        logits, painted, rotation, translation, memory = self.network(frame, action, latent, memory)
         if still:
             rotation, translation = torch.eye(3, device=rgb.device).expand_as(rotation), torch.zeros_like(translation)
         with torch.autocast(rgb.device.type, enabled=False):

@@ -22,7 +22,6 @@ from envs.errors import UsageError
 from worldmodel import losses
 from worldmodel.checkpoint import load_training, save_model, save_training
 from worldmodel.clips import Clips, ClipSource
-from worldmodel.compilation import can_compile
 from worldmodel.inference import InferenceNetwork
 from worldmodel.options import TrainOptions
 from worldmodel.pictures import picture_prediction
@@ -62,8 +61,6 @@ class Trainer:
         self.optimiser = torch.optim.Adam(parameters, lr=options.learning_rate)
         self.step, self.best, self.seconds = 0, -math.inf, 0.0
         self.bad_steps = 0
-        if options.compile and can_compile():
-            model.fast_network = torch.compile(model.network, dynamic=False)
 
     def run(self) -> None:
         """Train to the last step, resuming where the run's folder stands; SIGTERM saves and stops."""
