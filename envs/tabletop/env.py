@@ -245,7 +245,8 @@ class TabletopEnv(gymnasium.Env):
 
     def _make_observation_space(self) -> gymnasium.spaces.Dict:
         size, box = self.camera.height, gymnasium.spaces.Box
-        spaces: dict[str, gymnasium.Space] = {"proprio": box(-np.inf, np.inf, (15,), np.float32)}
+        bound = np.repeat(np.array([2, 3.15, 0.1, 4, 1], np.float32), [3, 3, 1, 7, 1])  # m, rad, m, rad, sign
+        spaces: dict[str, gymnasium.Space] = {"proprio": box(-bound, bound, dtype=np.float32)}
         if self.images:
             depth = box(self.camera.near, self.camera.far, (size, size), np.float32)
             spaces = {"rgb": box(0, 255, (size, size, 3), np.uint8), "depth": depth, **spaces}

@@ -1,4 +1,4 @@
-"""`python -m envs.tabletop.pictures --out docs/pictures`: a picture of each scene, as the robot and a visitor see it."""
+"""`python -m envs.tabletop.pictures --out docs/pictures`: each scene as the robot and as a visitor sees it."""
 
 from __future__ import annotations
 
