@@ -113,7 +113,7 @@ def load_model(name: str | Path, device: str | torch.device = "cpu") -> T3VIP:
         config, context = dict(document["model"]), dict(document["context"])
         model = T3VIP(ModelConfig(**config), ModelContext(**{k: _hashable(v) for k, v in context.items()}))
         model.load_state_dict(load_file(folder / WEIGHTS))
-    except (SafetensorError, json.JSONDecodeError, KeyError, TypeError, RuntimeError) as error:
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
         raise UsageError(
             f"the model in {folder} cannot be read ({reason}); train it again or restore the folder"
@@ -155,7 +155,7 @@ def load_training(run: Path, modules: Mapping[str, nn.Module], optimiser: torch.
         for prefix, module in modules.items():
             start = f"{prefix}."
             module.load_state_dict({k[len(start) :]: v for k, v in tensors.items() if k.startswith(start)})
-    except (SafetensorError, json.JSONDecodeError, RuntimeError) as error:
+    except (SafetensorError, OSError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
         raise UsageError(
             f"the checkpoint {folders[-1]} does not fit ({reason}); remove it, or give another --out"

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from envs.camera import CameraModel
+from envs.errors import UsageError
 from worldmodel import geometry
 from worldmodel.blocks import LSTMState
 from worldmodel.config import ModelConfig, ModelContext

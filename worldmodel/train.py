@@ -63,6 +63,8 @@ def _open(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
         train = ClipSource(dataset, options.frame_gap, slice(0, split))
         other = ClipSource(dataset, options.frame_gap, slice(split, None), share=train)
     frames = max(frames for _, frames in options.schedule.clip_lengths)
+    for clips in (train, other):
+        clips.starts(frames)  # now, not hours later, when the curriculum gets there
     return train, ValidationSet(other, options.validation_clips, frames, options.context, options.batch)
 
 
@@ -97,7 +99,10 @@ def _claim(options: TrainOptions) -> None:
     path = options.out / "config.json"
     document = _document(options)
     if path.exists():
-        before = json.loads(path.read_text())
+        try:
+            before = dict(json.loads(path.read_text()))
+        except (ValueError, TypeError) as error:
+            raise UsageError(f"{path} is damaged ({error}); restore it, or give another --out") from error
         for name in document:
             if name != "device" and before.get(name) != document[name]:
                 raise UsageError(

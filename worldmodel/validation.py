@@ -75,7 +75,7 @@ def validate(model: T3VIP, data: ValidationSet, still: bool = False) -> Scores:
         predicted_depth.append(free.stack("depth")[:, c - 1 :].cpu())
         rgb.append(clips.rgb[:, c - 1 :].cpu())
         depth.append(clips.depth[:, c - 1 :].cpu())
-        inpainted.append(free.stack("occlusion")[:, c - 1 :].mean().cpu())
+        inpainted.append(free.stack("occlusion")[:, c - 1 :].mean((1, 2, 3, 4)).cpu())
         if data.source.dataset.has_ground_truth:
             truth = data.source.truth_at(starts, data.frames)
             taught = unroll(model, clips, c, truth=1.0, still=still)
@@ -93,7 +93,7 @@ def validate(model: T3VIP, data: ValidationSet, still: bool = False) -> Scores:
         "copy_psnr": psnr_per_step(all_rgb[:, :1].expand_as(all_rgb[:, 1:]), all_rgb[:, 1:]).tolist(),
         "depth_rmse": depth_rmse.tolist(),
         "copy_depth_rmse": rmse_per_step(all_depth[:, :1].expand_as(all_depth[:, 1:]), all_depth[:, 1:]).tolist(),
-        "inpainted": float(torch.stack(inpainted).mean()),
+        "inpainted": float(torch.cat(inpainted).mean()),
         "score": float(psnr.mean() + depth_psnr.mean()),
     }
     if flows:
@@ -112,7 +112,7 @@ def _track(model: T3VIP, clips: Clips, truth: ClipTruth, free: Rollout, context:
     for b in range(len(points)):
         track = HandTrack.start(points[b], truth.tcp[b, context - 1].to(points), model.intrinsics, 1)
         for prediction in free.predictions[context - 1 :]:
-            track = track.advance(prediction.transform[b : b + 1])
+            track = track.advance(prediction.transform[b : b + 1], prediction.masks[b : b + 1, :1])
         ends.append(track.tcp[0].cpu())
     error = (torch.stack(ends) - truth.tcp[:, -1]).norm(dim=1)
     return error, (truth.tcp[:, -1] - truth.tcp[:, context - 1]).norm(dim=1)

@@ -1,0 +1,57 @@
+"""The inference network: clips of any length, what a latent sees, and that it can be learned."""
+
+import pytest
+import torch
+
+from worldmodel.inference import MIN_LOG_VARIANCE, InferenceNetwork
+
+
+@pytest.fixture
+def network():
+    torch.manual_seed(0)
+    return InferenceNetwork(4, 1, width=0.25, per_clip=False)
+
+
+def frames(length, seed=0):
+    return torch.rand((2, length, 4, 16, 24), generator=torch.Generator().manual_seed(seed))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("per_clip", [False, True])
+@pytest.mark.parametrize("length", [2, 3, 7])
+def test_any_clip_length(per_clip, length):
+    torch.manual_seed(0)
+    network = InferenceNetwork(4, 1, width=0.25, per_clip=per_clip)
+    mean, log_variance = network(frames(length))
+    assert mean.shape == log_variance.shape == (2, length - 1, 1, 2, 3)
+    assert log_variance.min() >= MIN_LOG_VARIANCE
+    assert mean.abs().max() < 0.3 and log_variance.abs().max() < 0.3  # near the prior at first
+    same_over_time = torch.allclose(mean, mean[:, :1].expand_as(mean), atol=1e-7)
+    assert same_over_time == (per_clip or length == 2)
+
+
+@torch.no_grad()
+def test_a_latent_sees_the_frames_around_it_and_the_clip(network):
+    clip = frames(5)
+    mean = network(clip)[0]
+    for changed in range(5):
+        other = clip.clone()
+        other[:, changed] = frames(1, seed=1)[:, 0]
+        difference = (network(other)[0] - mean).abs().amax((0, 2, 3, 4))
+        beside = [t for t in range(4) if changed in (t, t + 1)]
+        away = [t for t in range(4) if t not in beside]
+        assert difference.min() > 0  # through the mean over the clip
+        assert min(difference[beside]) > 1.5 * max(difference[away])
+
+
+def test_the_gradient_of_a_draw_reaches_every_weight(network):
+    mean, log_variance = network(frames(3))
+    noise = torch.randn(mean.shape, generator=torch.Generator().manual_seed(0))
+    weights = torch.randn(mean.shape, generator=torch.Generator().manual_seed(1))
+    (weights * (mean + (0.5 * log_variance).exp() * noise)).sum().backward()
+    for name, parameter in network.named_parameters():
+        assert parameter.grad.isfinite().all() and parameter.grad.abs().max() > 0, name
+    bias = network.heads.bias.grad  # of the mean, and of the log variance
+    torch.testing.assert_close(bias[0], weights.sum(), rtol=1e-4, atol=1e-4)
+    expected = (weights * 0.5 * (0.5 * log_variance).exp() * noise).sum().detach()
+    torch.testing.assert_close(bias[1], expected, rtol=1e-4, atol=1e-4)
