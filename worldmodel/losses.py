@@ -87,7 +87,7 @@ def nearest_in_window(query: Tensor, reference: Tensor, radius: int) -> Tensor:
         query = query.detach().contiguous()
         padded = torch.nn.functional.pad(reference.detach(), (radius,) * 4, value=_BEYOND_M)
         best = query.new_full((batch, height, width), float("inf"))
-        # A point that is not finite has no nearest neighbour: it keeps its own pixel, and the loss is not finite either.
+        # A point that is not finite has no nearest neighbour: it keeps its own pixel, and the loss is not finite.
         own = radius * window + radius
         where = torch.full((batch, height, width), own, dtype=torch.int32, device=query.device)
         for row in range(window):

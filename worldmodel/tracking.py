@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 HAND_RADIUS = 0.06  # metres; visible points this near to the TCP are taken for the hand
+LEAST_FOREGROUND = 0.02  # below this share of anything that moves, the hand counts as still
 MIN_HAND_PIXELS = 6  # of the fewest that a 64 x 64 picture shows of an unoccluded hand
 
 
@@ -67,23 +68,30 @@ class HandTrack:
         hand = points.flatten(1)[:, hand_pixels(points, tcp, radius)].T  # (M, 3)
         return cls(tcp.expand(futures, 3), hand.expand(futures, *hand.shape), K)
 
-    def advance(self, transform: Tensor) -> HandTrack:
+    def advance(self, transform: Tensor, background: Tensor) -> HandTrack:
         """One predicted step on.
 
-        Reads the transforms where the hand's points project to (between pixels: linearly), moves each point by its
-        own, and the TCP by their mean.
+        Reads transforms and background mask where the hand's points project to (between pixels: linearly), and moves
+        the points and the TCP as one body. Among the pixels near the hand some show the table behind it, and the mask
+        of the hand is soft: a plain mean of the transforms would lag behind. The blended transform of a pixel is
+        A = b I + (1 - b) M with b its background mask; so M, the motion of what moves there, is the mean of A - b I
+        over the mean of 1 - b. Where next to nothing moves, M goes over into the identity.
 
         Args:
             transform: (N, 3, 4, H, W) blended rigid transform of each pixel, camera frame.
+            background: (N, 1, H, W) the mask of the background, which never moves.
         """
         height, width = transform.shape[-2:]
         rays = self.points @ self.K.T  # (N, M, 3)
         pixels = rays[..., :2] / rays[..., 2:].clamp(min=1e-6)
         grid = 2 * pixels / torch.tensor([width - 1, height - 1], dtype=pixels.dtype, device=pixels.device) - 1
-        fields = transform.flatten(1, 2).to(pixels.dtype)
-        read = grid_sample(fields, grid[:, :, None], padding_mode="border", align_corners=True)  # (N, 12, M, 1)
-        read = read.squeeze(-1).transpose(1, 2).unflatten(2, (3, 4))  # (N, M, 3, 4)
-        points = (read[..., :3] @ self.points[..., None]).squeeze(-1) + read[..., 3]
-        mean = read.mean(dim=1)
-        tcp = (mean[..., :3] @ self.tcp[..., None]).squeeze(-1) + mean[..., 3]
+        fields = torch.cat((transform.flatten(1, 2), background), dim=1).to(pixels.dtype)
+        read = grid_sample(fields, grid[:, :, None], padding_mode="border", align_corners=True)  # (N, 13, M, 1)
+        mean = read.squeeze(-1).mean(dim=2)  # (N, 13)
+        still = torch.eye(3, 4, dtype=mean.dtype, device=mean.device)
+        behind = mean[:, 12, None, None].clamp(max=1 - LEAST_FOREGROUND)
+        motion = (mean[:, :12].unflatten(1, (3, 4)) - behind * still) / (1 - behind)  # (N, 3, 4)
+        turn, shift = motion[..., :3].mT, motion[..., 3]
+        points = self.points @ turn + shift[:, None]
+        tcp = (self.tcp[:, None] @ turn)[:, 0] + shift
         return HandTrack(tcp, points, self.K)

@@ -83,7 +83,7 @@ class T3VIPController(PlanningController):
             distances = []
             for step in range(actions.shape[1]):
                 future, prediction = self.model.step(future, actions[:, step])
-                track = track.advance(prediction.transform)
+                track = track.advance(prediction.transform, prediction.masks[:, :1])
                 distances.append((track.tcp - goal).norm(dim=-1))
             return discounted_distance(torch.stack(distances, dim=1).cpu().numpy())
 

@@ -62,7 +62,8 @@ class ExactModel:
         shift = 0.02 * action[:, self.channels][:, :3] @ rotation
         transform = torch.cat([torch.eye(3).expand(state, 3, 3), shift[:, :, None]], dim=2)
         field_ = transform[..., None, None].expand(state, 3, 4, self.camera.height, self.camera.width)
-        return state, SimpleNamespace(transform=field_)
+        masks = torch.zeros(state, 2, self.camera.height, self.camera.width)  # all that is seen moves
+        return state, SimpleNamespace(transform=field_, masks=masks)
 
 
 class ArrayWorld:

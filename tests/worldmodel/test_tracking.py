@@ -29,7 +29,9 @@ def square(transform_inside, corner, size=6, batch=2):
     field = torch.eye(3, 4, dtype=torch.float64)[None, :, :, None, None].repeat(batch, 1, 1, 64, 64)
     u, v = corner
     field[..., v : v + size, u : u + size] = transform_inside[None, :, :, None, None]
-    return field
+    background = torch.ones(batch, 1, 64, 64, dtype=torch.float64)
+    background[..., v : v + size, u : u + size] = 0
+    return field, background
 
 
 def intrinsics(camera):
@@ -61,9 +63,25 @@ def test_follows_the_hand_across_the_picture_exactly(camera):
     for du, dv in [(6, 0), (3, 5), (0, -8)]:  # whole pixels, farther than the hand is wide
         shift = torch.tensor([du * HAND / camera.K[0, 0], dv * HAND / camera.K[1, 1], 0.0], dtype=torch.float64)
         moved = torch.cat([torch.eye(3, dtype=torch.float64), shift[:, None]], dim=1)
-        track = track.advance(square(moved, corner))
+        track = track.advance(*square(moved, corner))
         corner, true = (corner[0] + du, corner[1] + dv), true + shift
         np.testing.assert_allclose(track.tcp, true.expand(2, 3), atol=1e-9)
+
+
+def test_background_around_and_soft_masks_do_not_hold_the_hand_back(camera):
+    """Half of the pixels chosen show the wall, and the hand's mask is soft: the blended transforms are too short."""
+    points, tcp = scene(camera)
+    shift = torch.tensor([0.02, 0.0, 0.01], dtype=torch.float64)
+    background = torch.full((1, 1, 64, 64), 1.0, dtype=torch.float64)
+    background[..., 24:30, 20:23] = 0.3
+    field = torch.eye(3, 4, dtype=torch.float64)[None, :, :, None, None].repeat(1, 1, 1, 64, 64)
+    field[:, :, 3] += (1 - background) * shift.view(1, 3, 1, 1)
+    track = HandTrack.start(points, tcp, intrinsics(camera), futures=1).advance(field, background)
+    np.testing.assert_allclose(track.tcp[0], tcp + shift, atol=1e-9)
+    still = HandTrack.start(points, tcp, intrinsics(camera), futures=1)
+    ones = torch.ones_like(background)
+    identity = torch.eye(3, 4, dtype=torch.float64)[None, :, :, None, None].expand(1, 3, 4, 64, 64)
+    np.testing.assert_allclose(still.advance(identity, ones).tcp[0], tcp, atol=1e-12)
 
 
 def test_rotation_and_motion_in_depth_move_the_tcp_as_part_of_the_body(camera):
@@ -78,7 +96,7 @@ def test_rotation_and_motion_in_depth_move_the_tcp_as_part_of_the_body(camera):
     track = HandTrack.start(points, tcp, intrinsics(camera), futures=3)
     expected = tcp
     for _ in range(2):
-        track = track.advance(everywhere)
+        track = track.advance(everywhere, torch.zeros(3, 1, 64, 64))
         expected = turn @ (expected - pivot) + pivot + shift
     np.testing.assert_allclose(track.tcp, expected.expand(3, 3), atol=1e-9)
 
@@ -89,6 +107,7 @@ def test_futures_are_apart_and_points_off_the_picture_do_no_harm(camera):
     far = torch.eye(3, 4, dtype=torch.float64).repeat(2, 1, 1)
     far[1, :, 3] = torch.tensor([-5.0, 3.0, 0.0])
     field = far[..., None, None].expand(2, 3, 4, 64, 64)
-    track = track.advance(field).advance(field)
+    nothing_behind = torch.zeros(2, 1, 64, 64)
+    track = track.advance(field, nothing_behind).advance(field, nothing_behind)
     np.testing.assert_allclose(track.tcp[0], tcp)
     np.testing.assert_allclose(track.tcp[1], tcp + 2 * far[1, :, 3])
