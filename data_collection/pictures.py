@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import imageio.v2 as imageio
 import imageio_ffmpeg
+import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,9 +23,7 @@ GAP = 4  # pixels between the tiles
 def colour_depth(raw: NDArray[np.uint16], low: float, high: float) -> NDArray[np.uint8]:
     """Stored depth (..., H, W) -> colours (..., H, W, 3): red at `low` or nearer, blue at `high`, in stored units."""
     unit = np.clip((raw.astype(np.float32) - low) / max(1.0, high - low), 0.0, 1.0)
-    flat = ((1.0 - unit) * 255).astype(np.uint8).reshape(-1, raw.shape[-1])
-    coloured = np.asarray(cv2.applyColorMap(flat, cv2.COLORMAP_TURBO), np.uint8)[..., ::-1]
-    return coloured.reshape(*raw.shape, 3)
+    return matplotlib.colormaps["turbo"](((1.0 - unit) * 255).astype(np.uint8), bytes=True)[..., :3]
 
 
 def write_contact_sheet(dataset: RGBDDataset, episodes: Sequence[int], path: Path) -> None:

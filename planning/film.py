@@ -8,11 +8,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
 import gymnasium as gym
 import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 
 from data_collection.files import written_aside
 from envs.camera import CameraModel
@@ -24,6 +24,7 @@ VIEWS = ("static", "side")
 STRIP_FRAMES = 6
 STEPS_PER_FRAME, FPS = 2, 15  # real time, at 30 control steps a second
 GOAL_COLOUR, TCP_COLOUR = (230, 30, 30), (40, 200, 255)
+FINE = 4  # lines are drawn this many times larger, then shrunk: smooth edges
 
 
 class Studio:
@@ -65,18 +66,17 @@ class Film:
         if step % STEPS_PER_FRAME:
             return
         views = [self._view(camera) for camera in self._studio.cameras]
-        frame = np.concatenate(views, axis=1)
         left = np.linalg.norm(self._path[-1] - self._setup.goal.point_world)
-        _write(frame, f"{self._caption}  step {step}  {100 * left:.1f} cm", (6, 14))
-        self.frames.append(frame)
+        text = f"{self._caption}  step {step}  {100 * left:.1f} cm"
+        self.frames.append(_captioned(np.concatenate(views, axis=1), text))
 
     def _view(self, camera: StaticCamera) -> NDArray[np.uint8]:
-        image = np.ascontiguousarray(camera.render(self._studio.tabletop.mj_data)[0])
+        picture = Image.fromarray(camera.render(self._studio.tabletop.mj_data)[0])
         way = _pixels(camera.geometry, np.array(self._path))
-        cv2.polylines(image, [way[:, None]], False, TCP_COLOUR, 1, cv2.LINE_AA, shift=4)
-        goal = _pixels(camera.geometry, self._setup.goal.point_world[None])[0] >> 4
-        cv2.drawMarker(image, goal.tolist(), GOAL_COLOUR, cv2.MARKER_CROSS, 13, 2, cv2.LINE_AA)
-        return image
+        u, v = _pixels(camera.geometry, self._setup.goal.point_world[None])[0]
+        _draw_lines(picture, [way], TCP_COLOUR, 1)
+        _draw_lines(picture, [[(u - 6, v), (u + 6, v)], [(u, v - 6), (u, v + 6)]], GOAL_COLOUR, 2)
+        return np.asarray(picture)
 
     def save(self, path: Path) -> None:
         """Write `path`.mp4 and `path`.png (a strip of some frames)."""
@@ -89,12 +89,25 @@ class Film:
             iio.imwrite(aside, np.concatenate(rows, axis=1), extension=".png")
 
 
-def _pixels(camera: CameraModel, points: NDArray) -> NDArray[np.int32]:
-    """World points (N, 3) as pixels in sixteenths, kept near the picture."""
+def _pixels(camera: CameraModel, points: NDArray) -> list[tuple[float, float]]:
+    """World points (N, 3) as pixels, kept near the picture."""
     pixels = np.nan_to_num(camera.project(camera.to_camera(points)))
-    return np.rint(16 * np.clip(pixels, -SIZE, 2 * SIZE)).astype(np.int32)
+    return [(float(u), float(v)) for u, v in np.clip(pixels, -SIZE, 2 * SIZE)]
 
 
-def _write(frame: NDArray[np.uint8], text: str, place: tuple[int, int]) -> None:
-    for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(frame, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, thickness, cv2.LINE_AA)
+def _draw_lines(
+    picture: Image.Image, lines: list[list[tuple[float, float]]], colour: tuple[int, int, int], width: int
+) -> None:
+    """Draw polylines of pixels (u, v), whose centres are integers."""
+    stencil = Image.new("L", (FINE * picture.width, FINE * picture.height))
+    draw = ImageDraw.Draw(stencil)
+    for line in lines:
+        draw.line([(FINE * (u + 0.5), FINE * (v + 0.5)) for u, v in line], 255, FINE * width, joint="curve")
+    picture.paste(colour, mask=stencil.resize(picture.size, Image.Resampling.BOX))
+
+
+def _captioned(frame: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+    picture = Image.fromarray(frame)
+    font = ImageFont.load_default(size=12)
+    ImageDraw.Draw(picture).text((6, 4), text, "white", font, stroke_width=1, stroke_fill="black")
+    return np.asarray(picture)
