@@ -1,1 +1,1 @@
-"""data_collection"""
+"""Datasets of RGB-D episodes: policies that act, the collector, the format, inspection."""

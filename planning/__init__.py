@@ -1,1 +1,1 @@
-"""planning"""
+"""Planning with world models: iCEM, controllers, and the servo evaluation."""

@@ -3,6 +3,7 @@
     RUN/
       config.json                 options of the run
       metrics.jsonl               one line an interval
+      tensorboard/, pictures/     for people
       model/                      the best model so far by validation score; what `load_model` reads
         config.json               architecture, context, and where it came from
         model.safetensors
@@ -23,7 +24,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from safetensors import SafetensorError
@@ -34,6 +35,7 @@ from envs.errors import UsageError
 from worldmodel.config import ModelConfig, ModelContext
 from worldmodel.t3vip import T3VIP
 
+Precision = Literal["auto", "float32", "bfloat16"]
 PRETRAINED = Path(__file__).parent / "pretrained"
 WEIGHTS, CONFIG, TRAINING, STATE = "model.safetensors", "config.json", "training.safetensors", "state.json"
 KEEP = 2
@@ -94,12 +96,13 @@ def find_model(name: str | Path) -> Path:
     )
 
 
-def load_model(name: str | Path, device: str | torch.device = "cpu") -> T3VIP:
+def load_model(name: str | Path, device: str | torch.device = "cpu", precision: Precision = "auto") -> T3VIP:
     """Load a world model for use.
 
     Args:
         name: see `find_model`.
         device: where it shall run.
+        precision: what its network runs in; `auto` is bfloat16 where the device computes in it, else float32.
 
     Returns:
         The model in evaluation mode.
@@ -118,7 +121,17 @@ def load_model(name: str | Path, device: str | torch.device = "cpu") -> T3VIP:
         raise UsageError(
             f"the model in {folder} cannot be read ({reason}); train it again or restore the folder"
         ) from error
+    model.precision = _best_precision(torch.device(device)) if precision == "auto" else getattr(torch, precision)
     return model.to(device).to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+
+
+def _best_precision(device: torch.device) -> torch.dtype:
+    """bfloat16 where the device has instructions for it; where it would be emulated, it is slower than float32."""
+    if device.type == "cuda":
+        native = torch.cuda.is_bf16_supported(including_emulation=False)
+    else:
+        native = getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)()
+    return torch.bfloat16 if native else torch.float32
 
 
 def _hashable(value: Any) -> Any:

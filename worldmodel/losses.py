@@ -101,14 +101,14 @@ def nearest_in_window(query: Tensor, reference: Tensor, radius: int) -> Tensor:
 
 
 def knn_distance(query: Tensor, reference: Tensor, radius: int) -> Tensor:
-    """Mean distance of each query point to its nearest reference point within the window, metres: Eqs. (9), (10)."""
+    """Mean distance of each query point to its nearest reference point within the window, metres: Eqs. (8), (9)."""
     index = nearest_in_window(query, reference, radius).flatten(1).unsqueeze(1).expand(-1, 3, -1)
     neighbours = reference.flatten(2).gather(2, index)
     return ((query.flatten(2) - neighbours).square().sum(1) + 1e-12).sqrt().mean()
 
 
 def knn_alignment(moved: Tensor, target: Tensor, radius: int) -> Tensor:
-    """Both directions of the point cloud alignment: Eq. (11), `(B, 3, H, W)` metres each."""
+    """Both directions of the point cloud alignment: Eq. (10), `(B, 3, H, W)` metres each."""
     return knn_distance(moved, target, radius) + knn_distance(target, moved, radius)
 
 

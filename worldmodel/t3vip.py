@@ -111,6 +111,8 @@ class T3VIP(nn.Module):
     def __init__(self, config: ModelConfig, context: ModelContext) -> None:
         super().__init__()
         self.config, self.context = config, context
+        self.precision = torch.float32
+        """What the network runs in; geometry and splatting always run in float32."""
         self.camera = CameraModel.from_json(context.camera)
         height, width = self.camera.height, self.camera.width
         if height % STRIDE or width % STRIDE:
@@ -205,10 +207,12 @@ class T3VIP(nn.Module):
         if self.latent_channels and latent is None:
             latent = rgb.new_zeros((batch, *self.latent_shape))
 
-        logits, painted, rotation, translation, memory = self.network(frame, action, latent, memory)
+        device = rgb.device.type
+        with torch.autocast(device, self.precision, enabled=self.precision != torch.float32):
+            logits, painted, rotation, translation, memory = self.network(frame, action, latent, memory)
         if still:
             rotation, translation = torch.eye(3, device=rgb.device).expand_as(rotation), torch.zeros_like(translation)
-        with torch.autocast(rgb.device.type, enabled=False):
+        with torch.autocast(device, enabled=False):
             masks = torch.softmax(logits.float(), dim=1)
             prediction = self._render(rgb.float(), depth.float(), masks, rotation, translation, painted.float())
         return prediction, memory
@@ -225,15 +229,14 @@ class T3VIP(nn.Module):
         return logits, painted, rotation, translation, [*encoder_memory, *mask_memory, *paint_memory]
 
     def blank_memory(self, like: Tensor) -> Memory:
-        """Zero states for a batch of frames `like` (B, ..., H, W), in the dtype that the network runs in."""
-        device = like.device.type
-        dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else torch.float32
+        """Zero states for a batch of frames `like` (B, ..., H, W), in the precision that the network runs in."""
         small, middle, large = self.encoder.channels
         layout = [(small, 2), (small, 2), (middle, 4), (middle, 4), (large, 8)] + 2 * [(middle, 4), (small, 2)]
         memory = []
         for channels, stride in layout:
             shape = (like.shape[0], channels, self.camera.height // stride, self.camera.width // stride)
-            zeros = torch.zeros(shape, dtype=dtype, device=like.device).contiguous(memory_format=torch.channels_last)
+            zeros = torch.zeros(shape, dtype=self.precision, device=like.device)
+            zeros = zeros.contiguous(memory_format=torch.channels_last)
             memory.append((zeros, zeros))
         return memory
 

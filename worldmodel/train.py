@@ -19,7 +19,7 @@ from worldmodel.t3vip import T3VIP
 from worldmodel.trainer import Trainer
 from worldmodel.validation import ValidationSet
 
-TEST_ONLY = "t3vip/TabletopD-v0"
+TEST_ONLY = "TabletopD-v0"
 """The unseen scene; training or tuning on it would make every figure about generalisation worthless."""
 HELD_OUT = 10
 """Without a validation set, one episode in so many is held out."""
@@ -46,7 +46,7 @@ def main(options: TrainOptions) -> None:
 def _open(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
     dataset = RGBDDataset(options.data)
     for opened in [dataset] + ([RGBDDataset(options.validation)] if options.validation else []):
-        if opened.attrs["env_id"] == TEST_ONLY:
+        if str(opened.attrs["env_id"]).endswith(TEST_ONLY):
             raise UsageError(
                 f"{opened.path} comes from {TEST_ONLY}, the test scene; train and validate on scene A, B or C"
             )

@@ -50,6 +50,7 @@ class Trainer:
         self.model, self.options, self.train_clips, self.validation = model, options, train, validation
         self.origin = origin
         self.device = model.device
+        model.precision = getattr(torch, options.precision)
         self.modules: dict[str, torch.nn.Module] = {"model": model}
         self.inference: InferenceNetwork | None = None
         if model.latent_channels:
@@ -133,9 +134,8 @@ class Trainer:
         noise = torch.Generator().manual_seed(_mix(options.seed, self.step))
         schedule = options.schedule
         truth = 1 - _ramp(self.progress, 0.0, schedule.truth_until)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=options.precision == "bfloat16"):
-            latents, kl = self._latents(clips, noise)
-            rollout = unroll(self.model, clips, options.context, latents, truth, noise)
+        latents, kl = self._latents(clips, noise)
+        rollout = unroll(self.model, clips, options.context, latents, truth, noise)
         terms = reconstruction_terms(self.model, rollout, clips, weights)
         if kl is not None:
             terms["kl"] = kl
@@ -173,7 +173,8 @@ class Trainer:
             return draws, None
         near, far = self.model.camera.near, self.model.camera.far
         frames = torch.cat((clips.rgb, (clips.depth - near) / (far - near)), dim=2)
-        mean, log_variance = self.inference(frames)
+        with torch.autocast(self.device.type, self.model.precision, enabled=self.model.precision != torch.float32):
+            mean, log_variance = self.inference(frames)
         pixels = self.model.camera.height * self.model.camera.width
         return mean + (0.5 * log_variance).exp() * draws, losses.kl_to_prior(mean, log_variance, pixels)
 

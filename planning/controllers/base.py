@@ -80,7 +80,7 @@ class HoldingController:
 
 
 class PlanningController(HoldingController):
-    """Searches the translations of the next second with iCEM and holds the first.
+    """Searches the translations of the next few frames with iCEM and holds the first.
 
     A subclass says in `imagine` what a sequence of translations costs.
     """
