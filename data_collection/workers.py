@@ -23,6 +23,7 @@ from data_collection.writer import shard_path, write_shard
 from envs.errors import UsageError
 
 MAX_FAILURES = 3
+START_SECONDS = 300.0  # to import everything and make the environment, on a busy machine
 ERROR_LOG = "errors.log"
 ONE_THREAD = {"LP_NUM_THREADS": "0", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """Each worker is one core's worth: without these, Mesa and BLAS start a thread per core in every worker."""
@@ -58,7 +59,7 @@ def collect_episodes(
         folder: where the shards go.
         episodes: the numbers to collect.
         workers: processes.
-        timeout: seconds an episode may take (a worker's first one with the making of its environment).
+        timeout: seconds an episode may take.
 
     Raises:
         UsageError: the environment cannot be used, or an episode failed `MAX_FAILURES` times.
@@ -122,27 +123,35 @@ class _Worker:
             self.process.start()
         theirs.close()
         self.begin(episode)
+        self._be_patient(START_SECONDS)
 
     def __str__(self) -> str:
         return f"{self.name} (pid {self.process.pid})"
 
     def begin(self, episode: int) -> None:
         self.episode = episode
-        self.deadline = time.monotonic() + self._timeout
+        self._be_patient(self._timeout)
         with contextlib.suppress(BrokenPipeError):  # it has just died: its sentinel tells
             self.connection.send(episode)
+
+    def _be_patient(self, seconds: float) -> None:
+        self._patience, self.deadline = seconds, time.monotonic() + seconds
 
     def news(self) -> tuple[str, str] | None:
         """What became of the episode: ("collected" | "failed" | "usage", detail); None while it is under way."""
         with contextlib.suppress(EOFError, ConnectionResetError):
             if self.connection.poll():
-                return self.connection.recv()
+                kind, detail = self.connection.recv()
+                if kind != "ready":
+                    return kind, detail
+                self._be_patient(self._timeout)
+                return None
         if not self.process.is_alive() or time.monotonic() < self.deadline:
             self.process.join(timeout=5.0)  # the pipe may break a moment before the process ends
             if not self.process.is_alive():
                 return "failed", _describe_exit(self.process.exitcode)
             return None
-        return "failed", f"hung: the episode was not done in {self._timeout:g} s"
+        return "failed", f"hung: the episode was not done in {self._patience:g} s"
 
     def stop(self) -> None:
         """End the process now; SIGKILL, because a hung or stopped one heeds nothing else."""
@@ -164,6 +173,7 @@ def work(manifest: Manifest, folder: Path, supervisor: Connection, supervisor_pi
             env = make_env(manifest.env_id, manifest.env_kwargs, manifest.ground_truth)
             attrs = describe_env(env, manifest.env_id, manifest.env_kwargs)
             attrs |= {"policy": manifest.policy, "seed": manifest.seed}
+            supervisor.send(("ready", ""))
             while True:
                 episode = supervisor.recv()
                 policy = make_policy(manifest.policy)
