@@ -51,6 +51,11 @@ def by(x: float, y: float, z: float) -> np.ndarray:
     return np.array([x, y, z])
 
 
+def put_blocks_away(env: TabletopEnv) -> None:
+    for i, name in enumerate(table.BLOCKS):
+        env.mj_data.joint(name).qpos[:3] = [2, 2 + i, 0.1]
+
+
 def site(env: TabletopEnv, name: str) -> np.ndarray:
     return env.mj_data.site(name).xpos.copy()
 
@@ -223,8 +228,7 @@ def test_the_door_slides(blind):
 
 def test_the_button_toggles_the_led_once_a_press(blind):
     blind.reset(seed=5, options={"tcp": FREE_SPACE})
-    for name in table.BLOCKS:
-        blind.mj_data.joint(name).qpos[:3] = [2, 2, 0.1]  # out of the way
+    put_blocks_away(blind)
     lit, top = blind.led_on, site(blind, "button_top")
     for _ in range(2):
         assert move_to(blind, top + by(0, 0, 0.08))
@@ -257,8 +261,7 @@ def test_the_switch_lights_the_bulb(blind):
 def test_blocks_can_be_lifted_and_put_down(blind, index):
     blind.reset(seed=2, options={"tcp": FREE_SPACE})
     place = np.array([0.05, -0.06, table.TOP + table.BLOCK_SIDE / 2])
-    for name in table.BLOCKS:
-        blind.mj_data.joint(name).qpos[:3] = [2, 2, 0.1]  # out of the way
+    put_blocks_away(blind)
     across = rotations.from_euler(np.array([0, 0, np.pi / 2]))  # the fingers close on its short side
     blind.mj_data.joint(table.BLOCKS[index]).qpos = [*place, *across]
     assert move_to(blind, place + by(0, 0, 0.1), gripper=1)
@@ -308,8 +311,7 @@ def test_scenes_c_and_d_look_different():
     for scene in "CD":
         env = TabletopEnv(scene, images=False)
         env.reset(seed=0)
-        for name in table.BLOCKS:
-            env.mj_data.joint(name).qpos[:3] = [5, 5, 0.1]
+        put_blocks_away(env)
         env.mj_data.qpos[env.kinematics.qpos_index] = [0.0, -1.5, 0, -2.5, 0, 1.5, 0]  # arm out of sight
         mujoco.mj_kinematics(env.mj_model, env.mj_data)
         wooden = np.isin(env.segmentation(), [env.mj_model.body(n).id for n in ("table", "drawer", "door")])
