@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.errors import UsageError
-from planning.noise import coloured_noise
+from data_collection.policies.coloured_noise import coloured_noise
 
 CostFunction = Callable[[NDArray[np.float64]], NDArray]
 """Action sequences (N, horizon, action_dim) -> costs (N,); one batched rollout of the model."""
@@ -20,7 +20,7 @@ CostFunction = Callable[[NDArray[np.float64]], NDArray]
 class ICEMConfig:
     """How iCEM searches; symbols are the paper's."""
 
-    horizon: int = 5
+    horizon: int = 3
     """actions planned ahead (h)"""
     population: int = 40
     """sequences sampled in the first iteration (N)"""

@@ -14,9 +14,12 @@ def coloured_noise(
 ) -> NDArray[np.float64]:
     """Gaussian noise of power spectral density 1/f^beta along the last axis, unit variance (Timmer & Koenig, 1995).
 
+    The zero frequency is kept, at the power of the lowest one, so that a short series has a mean of its own: without
+    it no sampled plan would ever go anywhere. Unit variance is that of all the rest.
+
     Args:
         beta: 0 is white, 1 pink, 2 red (a random walk's).
-        shape: of the result, (..., T) with T >= 2.
+        shape: of the result, (..., T).
         rng: source of randomness; as the package `colorednoise` draws from it.
         lowest: frequency in cycles a step below which the spectrum is flat; at least 1/T.
 
@@ -25,8 +28,8 @@ def coloured_noise(
     """
     shape = (shape,) if isinstance(shape, int) else tuple(shape)
     length = shape[-1]
-    if length < 2:
-        raise ValueError(f"coloured noise of length {length}; it needs at least 2")
+    if length == 1:  # no colour to have
+        return rng.standard_normal(shape)
     frequency = np.maximum(np.fft.rfftfreq(length), max(lowest, 1.0 / length))
     amplitude = frequency ** (-beta / 2.0)
     # The zero frequency is a constant offset, the Nyquist frequency counts once when the length is even.

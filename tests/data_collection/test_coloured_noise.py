@@ -4,7 +4,7 @@ import colorednoise
 import numpy as np
 import pytest
 
-from planning.noise import coloured_noise
+from data_collection.policies.coloured_noise import coloured_noise
 
 SERIES = 20_000
 
