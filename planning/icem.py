@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.errors import UsageError
 from data_collection.policies.coloured_noise import coloured_noise
+from envs.errors import UsageError
 
 CostFunction = Callable[[NDArray[np.float64]], NDArray]
 """Action sequences (N, horizon, action_dim) -> costs (N,); one batched rollout of the model."""

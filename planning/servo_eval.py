@@ -35,7 +35,7 @@ class ServoConfig:
     steps. The same command again goes on where a stopped run ended.
     """
 
-    out: Path
+    out: Path = Path("runs/servo")
     """folder for servo.json, episodes.jsonl, the bar chart and the videos"""
     model: tuple[str, ...] = ("t3vip",)
     """controllers to compare"""
@@ -116,8 +116,8 @@ def main(config: ServoConfig) -> None:
         disable_env_checker=True,
     )
     studio = Studio(env)
+    kit = Kit(env, config.planner, config.hold, config.checkpoints(), config.device, config.deadline)
     try:
-        kit = Kit(env, config.planner, config.hold, config.checkpoints(), config.device, config.deadline)
         learned = {name: kit.model(name) for name in config.model if name in LEARNED}
         kit.hold = next((model.frame_gap for model in learned.values()), config.hold)
         config.out.mkdir(parents=True, exist_ok=True)
@@ -127,6 +127,7 @@ def main(config: ServoConfig) -> None:
                 log.append(record)
             report(config, log)
     finally:
+        kit.close()
         studio.close()
         env.close()
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from envs.tabletop.simulate import rollout_tcp
 from numpy.typing import NDArray
 
+from envs.tabletop.simulate import rollout_tcp
 from planning.controllers.base import Goal, Observation, held_gripper
 from planning.controllers.baselines import METRES_PER_ACTION
 from planning.costs import env_action
@@ -18,11 +18,13 @@ SETUP_ENTROPY = 0x5E7_0_90A1  # sets the seeds of setups apart from every seed t
 SEED_OFFSET = 2**62  # environments of setups are seeded above it, those of training data below
 
 NEAREST, FARTHEST = 0.20, 0.45  # metres from the TCP to the goal
-NEAREST_PIXELS = 12.0  # and in the picture
-BORDER_PIXELS = 3.0  # from the goal to the edge of the picture
+REFERENCE_WIDTH = 64  # of the picture that the numbers of pixels below are meant for
+NEAREST_PIXELS = 12.0  # from the TCP to the goal in it
+BORDER_PIXELS = 4.0  # from TCP and goal to the edge of the picture, so that the hand is in it
 CLEARANCE = 0.02  # metres that the goal stands in front of every surface the camera sees around it
-STEPS, TRAVEL_STEPS = 100, 60  # of the straight-line motion that proves a goal reachable; the rest it stands
-REACHED = 0.025  # of the way may be left while it stands
+ROOM = 0.04  # metres to every side of the goal into which the hand may stray: a push against furniture traps the arm
+STEPS, TRAVEL_STEPS = 60, 45  # of the straight-line motion that proves a goal reachable; the rest it stands
+REACHED = 0.005  # metres that may be left while it stands
 GOALS_PER_SCENE = 40  # tries before the scene is drawn anew
 SCENES = 100
 
@@ -96,12 +98,14 @@ def _draw_goal(tabletop: Any, tcp: NDArray[np.float64], rng: np.random.Generator
 
 
 def _in_sight(tabletop: Any, goal: Goal, tcp: NDArray, depth: NDArray) -> bool:
-    """Whether the goal is well inside the picture, far from the TCP in it, and in front of what stands there."""
+    """Whether TCP and goal are well inside the picture and apart in it, the goal in front of what stands there."""
     camera = tabletop.camera
-    if np.linalg.norm(goal.pixel - camera.project(camera.to_camera(tcp))) < NEAREST_PIXELS:
+    scale = camera.width / REFERENCE_WIDTH
+    pixels = np.stack([camera.project(camera.to_camera(tcp)), goal.pixel])
+    farthest = np.array([camera.width, camera.height]) - 1 - scale * BORDER_PIXELS
+    if np.any(pixels < scale * BORDER_PIXELS) or np.any(pixels > farthest):
         return False
-    border = BORDER_PIXELS
-    if np.any(goal.pixel < border) or np.any(goal.pixel > np.array([camera.width, camera.height]) - 1 - border):
+    if np.linalg.norm(pixels[1] - pixels[0]) < scale * NEAREST_PIXELS:
         return False
     u, v = np.rint(goal.pixel).astype(int)
     around = depth[v - 1 : v + 2, u - 1 : u + 2]
@@ -109,12 +113,21 @@ def _in_sight(tabletop: Any, goal: Goal, tcp: NDArray, depth: NDArray) -> bool:
 
 
 def _reachable(tabletop: Any, state: NDArray, gripper: float, goal: Goal, tcp: NDArray) -> bool:
-    """Whether the straight way leads there in a copy of the simulator: neither goal nor way is inside furniture."""
-    moves = np.zeros((STEPS, 3))
-    moves[:TRAVEL_STEPS] = (goal.point_world - tcp) / TRAVEL_STEPS / METRES_PER_ACTION
-    path = rollout_tcp(tabletop, state[None], env_action(moves, gripper)[None])[0]
-    left = np.linalg.norm(path - goal.point_world, axis=-1)
-    return bool(np.all(left[-5:] <= REACHED * np.linalg.norm(goal.point_world - tcp)))
+    """Whether the straight way leads there in copies of the simulator, and there is room: no furniture is met.
+
+    The copies go to the goal, then to the points that lie ROOM from it along each axis (or at the workspace's edge).
+    """
+    offsets = ROOM * np.concatenate([np.eye(3), -np.eye(3)])
+    around = np.clip(goal.point_world + offsets, *tabletop.workspace)
+    return all(_arrives(tabletop, state, gripper, tcp, ends) for ends in (goal.point_world[None], around))
+
+
+def _arrives(tabletop: Any, state: NDArray, gripper: float, tcp: NDArray, ends: NDArray) -> bool:
+    """Whether straight motions from the TCP arrive at all the ends (N, 3) and come to rest there."""
+    moves = np.zeros((len(ends), STEPS, 3))
+    moves[:, :TRAVEL_STEPS] = (ends - tcp)[:, None] / TRAVEL_STEPS / METRES_PER_ACTION
+    path = rollout_tcp(tabletop, state, env_action(moves, gripper))
+    return bool(np.all(np.linalg.norm(path[:, -5:] - ends[:, None], axis=-1) <= REACHED))
 
 
 def _measured(tabletop: Any, index: int, env_seed: int, state: NDArray, goal: Goal, tcp: NDArray) -> Setup:

@@ -15,7 +15,7 @@ __all__ = ["CONTROLLERS", "LEARNED", "Controller", "Goal", "Kit"]
 # A new controller is one line.
 CONTROLLERS: dict[str, Callable[[Kit], Controller]] = {
     "t3vip": lambda kit: T3VIPController(kit.model("t3vip"), kit.camera, kit.planner()),
-    "oracle": lambda kit: OracleController(kit.env, kit.planner(), kit.hold),
+    "oracle": lambda kit: OracleController(kit.env, kit.simulator, kit.planner(), kit.hold),
     "linear": lambda kit: LinearController(kit.planner(), kit.hold),
     "proportional": lambda kit: ProportionalController(),
     "random": lambda kit: RandomController(kit.hold, kit.rng),

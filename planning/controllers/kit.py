@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from envs.camera import CameraModel
 from envs.errors import UsageError
+from envs.tabletop.simulate import BatchSimulator
 from planning.icem import ICEM, ICEMConfig
 from worldmodel import checkpoint
 
@@ -43,6 +45,16 @@ class Kit:
     def camera(self) -> CameraModel:
         """Geometry of the camera; nothing that moves."""
         return self.env.unwrapped.camera  # type: ignore[attr-defined]
+
+    @functools.cached_property
+    def simulator(self) -> BatchSimulator:
+        """What-if in the real simulator; for the oracle only."""
+        return BatchSimulator(self.env.unwrapped)  # type: ignore[arg-type]
+
+    def close(self) -> None:
+        """End the simulator's threads."""
+        if "simulator" in self.__dict__:
+            self.simulator.close()
 
     def planner(self) -> ICEM:
         """A planner of translations, with the randomness of this episode."""

@@ -6,9 +6,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from envs.tabletop.simulate import rollout_tcp
 from numpy.typing import NDArray
 
+from envs.tabletop.simulate import BatchSimulator
 from planning.controllers.base import Observation, PlanningController
 from planning.costs import discounted_distance, env_action
 from planning.icem import ICEM, CostFunction
@@ -19,22 +19,24 @@ class OracleController(PlanningController):
 
     Args:
         env: the tabletop environment that is being controlled.
+        simulator: of the same environment.
         planner: searches sequences of translations.
         hold: control steps that each translation is held for.
     """
 
     name = "oracle"
 
-    def __init__(self, env: gym.Env, planner: ICEM, hold: int) -> None:
+    def __init__(self, env: gym.Env, simulator: BatchSimulator, planner: ICEM, hold: int) -> None:
         super().__init__(planner, hold)
-        self.simulator: Any = env.unwrapped
+        self.simulator = simulator
+        self.tabletop: Any = env.unwrapped
 
     def imagine(self, observation: Observation) -> CostFunction:
-        state = self.simulator.get_state()
+        state = self.tabletop.get_state()
 
         def cost(sequences: NDArray) -> NDArray:
             actions = np.repeat(env_action(sequences, self.gripper), self.hold, axis=1)  # (N, h * hold, 7)
-            path = rollout_tcp(self.simulator, np.tile(state, (len(sequences), 1)), actions)
+            path = self.simulator.rollout_tcp(state, actions)
             reached = path[:, self.hold - 1 :: self.hold]  # (N, h, 3), after each held translation
             return discounted_distance(np.linalg.norm(reached - self.goal.point_world, axis=-1))
 
