@@ -36,7 +36,7 @@ def make_camera(width: int = 24, height: int = 16, near: float = 1.0, far: float
 def square_episode(camera: CameraModel, rng: np.random.Generator, rows: int) -> dict[str, np.ndarray]:
     """An episode's columns. Actions 0 to 2 shift the square along the camera's axes, 5 turns it about the optical
     axis, the others do nothing; the column `state` holds centre (camera frame, metres) and angle."""
-    actions = rng.uniform(-1, 1, (rows, 7)).astype(np.float32)
+    actions = (0.7 * rng.uniform(-1, 1, 7) + 0.3 * rng.uniform(-1, 1, (rows, 7))).astype(np.float32)
     actions[-1] = 0
     start = np.array([*rng.uniform([-0.3, -0.15, 1.4], [0.3, 0.15, 1.6]), rng.uniform(-0.5, 0.5)])
     moves = actions[:-1, [0, 1, 2, 5]] * np.array(SCALE)[[0, 1, 2, 5]]

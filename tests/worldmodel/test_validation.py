@@ -1,0 +1,93 @@
+"""Scores against references, and the scores of models whose scores are known."""
+
+import json
+
+import pytest
+import torch
+from torchmetrics.image import PeakSignalNoiseRatio
+
+from worldmodel.metrics import flow_scores, psnr_per_step, rmse_per_step
+from worldmodel.pictures import colour_wheel, picture_prediction
+from worldmodel.validation import ValidationSet, summary, validate
+
+
+@pytest.fixture
+def validation(source):
+    return ValidationSet(source, clips=5, frames=5, context=2, batch=2)
+
+
+def test_psnr_is_that_of_torchmetrics():
+    generator = torch.Generator().manual_seed(0)
+    predicted, target = (torch.rand((4, 3, 3, 8, 10), generator=generator) for _ in range(2))
+    for t, value in enumerate(psnr_per_step(predicted, target)):
+        reference = PeakSignalNoiseRatio(data_range=1.0)(predicted[:, t], target[:, t])
+        assert float(value) == pytest.approx(float(reference), abs=1e-4)
+
+
+def test_rmse():
+    target = torch.zeros(2, 2, 1, 3, 3)
+    predicted = target.clone()
+    predicted[0, 1] = 0.2
+    assert rmse_per_step(predicted, target).tolist() == pytest.approx([0, 0.2 / 2**0.5])
+
+
+def test_flow_scores_of_known_flows():
+    true = torch.zeros(1, 2, 3, 4, 4)
+    true[:, :, 0, :2] = 0.02  # the upper half moves, of which the hand is a half
+    hand = torch.zeros(1, 2, 4, 4, dtype=torch.bool)
+    hand[:, :, 0] = True
+
+    def scores(predicted):
+        return flow_scores(predicted, true, hand)
+
+    assert scores(true) == {"flow_error_moving": 0.0, "flow_error_hand": 0.0, "false_flow_m": 0.0}
+    nothing = scores(torch.zeros_like(true))
+    assert nothing["flow_error_moving"] == pytest.approx(1) and nothing["flow_error_hand"] == pytest.approx(1)
+    everywhere = torch.zeros_like(true)
+    everywhere[:, :, 0] = 0.02
+    assert scores(everywhere)["false_flow_m"] == pytest.approx(0.02)
+    hand_only = torch.where(hand[:, :, None], true, torch.zeros_like(true))
+    mixed = scores(hand_only)
+    assert mixed["flow_error_hand"] == 0 and mixed["flow_error_moving"] == pytest.approx(0.5)
+
+
+def test_without_transforms_the_scores_are_those_of_copying(make_model, validation):
+    model = make_model()
+    still, moving = validate(model, validation, still=True), validate(model, validation)
+    assert still["psnr"] == pytest.approx(still["copy_psnr"], abs=0.02)
+    assert still["depth_rmse"] == pytest.approx(still["copy_depth_rmse"], rel=1e-3)
+    assert still["inpainted"] == 0 and still["false_flow_m"] < 1e-5
+    for name in ("flow_error_moving", "flow_error_hand", "tracking_error"):
+        assert still[name] == pytest.approx(1, abs=1e-3)
+    assert moving["psnr"][0] < still["psnr"][0] - 1 and moving["inpainted"] > 0  # random motion is worse than none
+    assert moving["copy_psnr"] == still["copy_psnr"]
+
+
+def test_scores_do_not_depend_on_the_batches(make_model, source, validation):
+    model = make_model().train()
+    whole = validate(model, ValidationSet(source, clips=5, frames=5, context=2, batch=5))
+    assert model.training
+    for name, value in validate(model, validation).items():
+        assert value == pytest.approx(whole[name], rel=1e-2), name
+    assert len(whole["psnr"]) == 3 and "dB over copy" in summary(whole) and "tracking error" in summary(whole)
+    json.dumps(whole, allow_nan=False)
+
+
+def test_the_hue_is_the_direction():
+    flow = torch.zeros(2, 1, 3)
+    flow[0, 0, 1], flow[0, 0, 2] = 5.0, -5.0
+    still, right, left = colour_wheel(flow, 5.0)[0].tolist()
+    assert still == [255, 255, 255] and right == [255, 0, 0] and left == [0, 255, 255]
+
+
+def test_pictures_show_every_row_for_each_step(make_model, source, validation, tmp_path):
+    import imageio.v3 as imageio
+
+    clips, starts = next(validation.batches())
+    truth = source.truth_at(starts[:1], validation.frames)
+    picture_prediction(make_model(), clips, truth, 2, tmp_path / "new" / "a.png", scale=1)
+    sheet = imageio.imread(tmp_path / "new" / "a.png")
+    assert sheet.shape == (9 * 18 - 2, 3 * 26 - 2, 3)
+    first = (255 * clips.rgb[0, 2]).round().byte().permute(1, 2, 0).numpy()
+    assert (sheet[:16, :24] == first).all()
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["a.png"]
