@@ -170,7 +170,7 @@ def test_the_gripper_follows_the_sign(blind_c):
     for command, width in ((-1.0, 0.0), (1.0, 0.08)):
         for _ in range(15):
             observation = blind_c.step([0, 0, 0, 0, 0, 0, command])[0]
-        assert observation["proprio"][6] == pytest.approx(width, abs=2e-3)
+        assert observation["proprio"][6] == pytest.approx(width, abs=4e-3)
         assert observation["proprio"][14] == command
 
 
@@ -178,6 +178,7 @@ def test_the_hand_lags_less_than_a_tenth_of_a_step(blind_c):
     rng, action, lags = np.random.default_rng(5), np.zeros(7), []
     for episode in range(4):
         blind_c.reset(seed=episode, options={"tcp": FREE_SPACE})
+        put_blocks_away(blind_c)
         for _ in range(15):
             action = 0.9 * action + 0.2 * rng.normal(size=7)
             blind_c.step(np.clip(action, -1, 1))
