@@ -1,0 +1,126 @@
+"""Every benchmark by its name: what is compared with what. A quick run has sizes to try it out, not to quote."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+from tests.benchmarks.child import measure
+from tests.benchmarks.result import Result, cost, rate
+from tests.benchmarks.timing import MMAP_EVERYTHING
+
+PLAN_LIMIT_S = 0.4
+WAIT_LIMIT_PERCENT = 5.0
+KNN_RADIUS = 5  # the presets'
+
+
+def tabletop_rgbd_steps(quick: bool) -> Result:
+    """Control steps of the tabletop with RGB-D on one core."""
+    ours = measure("rendering.tabletop_steps", cores=1, steps=5 if quick else 150, repeats=1 if quick else 5)
+    stock = measure("rendering.robosuite_steps", 1, _same_opengl(), steps=2 if quick else 30, repeats=1 if quick else 5)
+    what = "robosuite's camera path (Lift, Panda, OSC_POSE, one 64x64 camera with depth, 30 Hz), one core"
+    return rate("tabletop_rgbd_steps", ours, "steps/s", stock, what)
+
+
+def rgbd_frames(quick: bool) -> Result:
+    """Supersampled RGB-D frames of the tabletop on one core."""
+    size = {"frames": 3 if quick else 100, "repeats": 1 if quick else 5}
+    ours = measure("rendering.tabletop_frames", cores=1, **size)
+    two_pass = measure("rendering.two_pass_frames", 1, _same_opengl(), **size)
+    return rate("rgbd_frames", ours, "frames/s", two_pass, "mujoco.Renderer twice at 192x192, averaged, one core")
+
+
+def collect(quick: bool) -> Result:
+    """Collecting scripted play with two workers."""
+    size = {"episodes": 4, "steps": 5} if quick else {"episodes": 14, "steps": 120}
+    one, two = (measure("collection.collected_steps", workers=workers, **size) for workers in (1, 2))
+    return rate("collect", two, "steps/s", one, "the same with one worker; this with two, on two cores")
+
+
+def knn_loss(quick: bool) -> Result:
+    """The kNN loss on all predictions of a batch, forward and backward."""
+    size = _knn_size(quick) | {"repeats": 1 if quick else 7}
+    ours, unfolded = (measure("losses.knn_seconds", kind=kind, **size) for kind in ("ours", "plain"))
+    return cost("knn_loss", ours, "s", unfolded, "unfold")
+
+
+def knn_loss_memory(quick: bool) -> Result:
+    """Peak memory of the same."""
+    ours, unfolded = (
+        measure("losses.knn_mebibytes", environment=MMAP_EVERYTHING, kind=kind, **_knn_size(quick))
+        for kind in ("ours", "plain")
+    )
+    return cost("knn_loss_memory", ours, "MiB", unfolded, "unfold")
+
+
+def splat(quick: bool) -> Result:
+    """Splatting a batch of RGB-D frames in mode `average`, forward and backward."""
+    size = {"frames": 2, "size": 16, "repeats": 1} if quick else {"frames": 16, "size": 64, "repeats": 31}
+    ours, plain = (measure("losses.splat_seconds", kind=kind, **size) for kind in ("ours", "plain"))
+    return cost("splat", 1e3 * ours, "ms", 1e3 * plain, "index_add of the four corners")
+
+
+def train_step(quick: bool) -> Result:
+    """An update of the `cpu` preset: 16 clips of 12 frames, all losses."""
+    repeats = 1 if quick else 3  # it is long
+    plain = measure("training.step_seconds", kind="plain", preset=_preset(quick), repeats=repeats)
+    what = "the same network in fp32, default layout, eager, sum over transformed clouds, unfold"
+    return cost("train_step", _our_training(quick)["update"], "s", plain["update"], what)
+
+
+def data_wait(quick: bool) -> Result:
+    """What share of a training step goes into waiting for its clips."""
+    ours = _our_training(quick)
+    share = 100 * ours["wait"] / (ours["wait"] + ours["update"])
+    return cost("data_wait", share, "%", WAIT_LIMIT_PERCENT, "the limit")
+
+
+def plan_action(quick: bool) -> Result:
+    """A planned action of the T3VIP controller on two cores."""
+    search = {"population": 4, "iterations": 1, "elites": 2} if quick else {}
+    found = measure("planning.action_seconds", decisions=1 if quick else 15, search=search)
+    what = f"the limit; {found['rollouts']} rollouts, {found['model']} model"
+    return cost("plan_action", found["seconds"], "s", PLAN_LIMIT_S, what)
+
+
+BENCHMARKS: dict[str, Callable[[bool], Result]] = {
+    function.__name__: function
+    for function in (
+        tabletop_rgbd_steps,
+        rgbd_frames,
+        collect,
+        knn_loss,
+        knn_loss_memory,
+        splat,
+        train_step,
+        data_wait,
+        plan_action,
+    )
+}
+
+
+@functools.cache
+def opengl() -> str:
+    """What draws here, e.g. `egl: llvmpipe (...)`."""
+    return str(measure("rendering.opengl", cores=1))
+
+
+def _same_opengl() -> dict[str, str]:
+    """Lets the usual ways, which do not choose by themselves, draw with what we draw with."""
+    return {"MUJOCO_GL": opengl().split(":")[0]}
+
+
+@functools.cache
+def _our_training(quick: bool) -> dict[str, float]:
+    size = {"preset": _preset(quick), "repeats": 1 if quick else 9}
+    return dict(measure("training.step_seconds", kind="ours", **size))
+
+
+def _preset(quick: bool) -> str:
+    return "tiny" if quick else "cpu"
+
+
+def _knn_size(quick: bool) -> dict[str, Any]:
+    batch, predictions = (1, 2) if quick else (16, 11)
+    return {"frames": batch * predictions, "size": 16 if quick else 64, "radius": 2 if quick else KNN_RADIUS}
