@@ -10,6 +10,7 @@ from tests.benchmarks.child import measure
 from tests.benchmarks.result import Result, cost, rate
 from tests.benchmarks.timing import MMAP_EVERYTHING
 
+Size = dict[str, Any]  # arguments of a subject
 PLAN_LIMIT_S = 0.4
 WAIT_LIMIT_PERCENT = 5.0
 KNN_RADIUS = 5  # the presets'
@@ -25,7 +26,7 @@ def tabletop_rgbd_steps(quick: bool) -> Result:
 
 def rgbd_frames(quick: bool) -> Result:
     """Supersampled RGB-D frames of the tabletop on one core."""
-    size = {"frames": 3 if quick else 100, "repeats": 1 if quick else 5}
+    size: Size = {"frames": 3 if quick else 100, "repeats": 1 if quick else 5}
     ours = measure("rendering.tabletop_frames", cores=1, **size)
     two_pass = measure("rendering.two_pass_frames", 1, _same_opengl(), **size)
     return rate("rgbd_frames", ours, "frames/s", two_pass, "mujoco.Renderer twice at 192x192, averaged, one core")
@@ -33,7 +34,7 @@ def rgbd_frames(quick: bool) -> Result:
 
 def collect(quick: bool) -> Result:
     """Collecting scripted play with two workers."""
-    size = {"episodes": 4, "steps": 5} if quick else {"episodes": 14, "steps": 120}
+    size: Size = {"episodes": 4, "steps": 5} if quick else {"episodes": 14, "steps": 120}
     one, two = (measure("collection.collected_steps", workers=workers, **size) for workers in (1, 2))
     return rate("collect", two, "steps/s", one, "the same with one worker; this with two, on two cores")
 
@@ -56,7 +57,7 @@ def knn_loss_memory(quick: bool) -> Result:
 
 def splat(quick: bool) -> Result:
     """Splatting a batch of RGB-D frames in mode `average`, forward and backward."""
-    size = {"frames": 2, "size": 16, "repeats": 1} if quick else {"frames": 16, "size": 64, "repeats": 31}
+    size: Size = {"frames": 2, "size": 16, "repeats": 1} if quick else {"frames": 16, "size": 64, "repeats": 31}
     ours, plain = (measure("losses.splat_seconds", kind=kind, **size) for kind in ("ours", "plain"))
     return cost("splat", 1e3 * ours, "ms", 1e3 * plain, "index_add of the four corners")
 
@@ -113,7 +114,7 @@ def _same_opengl() -> dict[str, str]:
 
 @functools.cache
 def _our_training(quick: bool) -> dict[str, float]:
-    size = {"preset": _preset(quick), "repeats": 1 if quick else 9}
+    size: Size = {"preset": _preset(quick), "repeats": 1 if quick else 9}
     return dict(measure("training.step_seconds", kind="ours", **size))
 
 
@@ -121,6 +122,6 @@ def _preset(quick: bool) -> str:
     return "tiny" if quick else "cpu"
 
 
-def _knn_size(quick: bool) -> dict[str, Any]:
+def _knn_size(quick: bool) -> Size:
     batch, predictions = (1, 2) if quick else (16, 11)
     return {"frames": batch * predictions, "size": 16 if quick else 64, "radius": 2 if quick else KNN_RADIUS}

@@ -40,7 +40,7 @@ def splat_seconds(kind: str, frames: int, size: int, repeats: int) -> float:
     def work() -> None:
         values.grad = pixels.grad = None
         picture, coverage = forward[kind]()
-        (picture.square().sum() + coverage.square().sum()).backward()  # type: ignore[no-untyped-call]
+        (picture.square().sum() + coverage.square().sum()).backward()
 
     return median_seconds(work, repeats, warmup=2)
 
@@ -60,6 +60,6 @@ def _knn(kind: str, frames: int, size: int, radius: int) -> Callable[[], None]:
 
     def work() -> None:
         moved.grad = None
-        KNN[kind](moved, target, radius).backward()  # type: ignore[no-untyped-call]
+        KNN[kind](moved, target, radius).backward()
 
     return work

@@ -62,7 +62,7 @@ class MadeUpDataset:
     def __init__(self, episodes: int = 8, rows: int = 241) -> None:
         rng = np.random.default_rng(0)
         shape = (episodes * rows, SIZE, SIZE)
-        self._columns = {
+        self._columns: dict[str, np.ndarray] = {
             "rgb": rng.integers(0, 256, (*shape, 3), np.uint8),
             "depth": rng.integers(20_000, 40_000, shape, np.uint16),
             "action": rng.uniform(-1, 1, (shape[0], ACTION_DIM)).astype(np.float32),
