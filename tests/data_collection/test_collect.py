@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import assert_one_line_error, call, finish, options, start
+from commands import assert_one_line_error, call, finish, options, start
 from standin import FAR, NEAR, StandIn, reset_seed
 
 from data_collection.collect import Config, main

@@ -1,6 +1,5 @@
 """What is written comes back, and what is wrong is named."""
 
-import json
 import multiprocessing
 import pickle
 import shutil
@@ -10,47 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from shards import ATTRS, CAMERA, flip_a_byte_of, make_episode
 
 from data_collection.dataset import RGBDDataset
 from data_collection.schema import DEPTH_STEPS, DamagedShard, dequantise_depth, episode_hash, quantise_depth, read_shard
 from data_collection.writer import read_episode, write_shard
-from envs.camera import CameraModel
 from envs.errors import UsageError
-
-CAMERA = CameraModel.from_fovy(16, 12, 30.0, np.eye(4), 1.0, 3.0)
-ATTRS = {
-    "env_id": "some/Env-v0",
-    "env_kwargs": {"image_size": 16},
-    "policy": "random",
-    "seed": 3,
-    "control_rate": 10.0,
-    "K": CAMERA.K,
-    "world_T_camera": CAMERA.world_T_camera,
-    "near": CAMERA.near,
-    "far": CAMERA.far,
-    "camera": json.loads(CAMERA.to_json()),
-    "action_aggregation": ["sum", "last"],
-    "action_scale": [0.1, 1.0],
-    "body_names": ["world"],
-    "hand_body_ids": [],
-    "versions": {},
-    "gl_renderer": "none",
-}
-
-
-def make_episode(rng, rows, ground_truth=False):
-    columns = {
-        "rgb": rng.integers(0, 256, (rows, 12, 16, 3), np.uint8),
-        "depth": rng.integers(0, DEPTH_STEPS + 1, (rows, 12, 16), np.uint16),
-        "action": rng.normal(size=(rows, 2)).astype(np.float32),
-        "proprio": rng.normal(size=(rows, 4)).astype(np.float32),
-        "state": rng.normal(size=(rows, 9)),
-        "reward": rng.normal(size=rows).astype(np.float32),
-    }
-    if ground_truth:
-        columns["segmentation"] = rng.integers(0, 9, (rows, 12, 16), np.uint8)
-        columns["body_pose"] = rng.normal(size=(rows, 3, 7)).astype(np.float32)
-    return columns
 
 
 @pytest.fixture
@@ -202,15 +166,6 @@ def test_damaged_shard_is_named_when_opened(folder, damage):
         DamagedShard, match=r"shard-00001\.h5 is damaged \(.*\); drop it with: inspect-dataset .* --repair"
     ):
         RGBDDataset(folder)
-
-
-def flip_a_byte_of(path, column):
-    """Change the middle byte of a column's first stored chunk."""
-    with h5py.File(path, "r") as file:
-        place = file[column].id.get_chunk_info(0)
-    content = bytearray(path.read_bytes())
-    content[place.byte_offset + place.size // 2] ^= 0xFF
-    path.write_bytes(content)
 
 
 def test_damaged_chunk_is_named_when_read(folder):

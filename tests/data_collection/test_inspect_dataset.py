@@ -6,8 +6,8 @@ import shutil
 import imageio.v2 as imageio
 import numpy as np
 import pytest
-from conftest import assert_one_line_error, call, options
-from test_dataset import ATTRS, flip_a_byte_of, make_episode
+from commands import assert_one_line_error, call, options
+from shards import ATTRS, flip_a_byte_of, make_episode
 
 from data_collection.dataset import RGBDDataset
 from data_collection.files import locked

@@ -1,7 +1,7 @@
 """The collector on the real table: pictures and physics do not depend on who collects, or on what came before."""
 
 import numpy as np
-from conftest import call, options
+from commands import call, options
 
 from data_collection.dataset import RGBDDataset
 from envs.ground_truth import scene_flow
