@@ -20,7 +20,7 @@ CostFunction = Callable[[NDArray[np.float64]], NDArray]
 class ICEMConfig:
     """How iCEM searches; symbols are the paper's."""
 
-    horizon: int = 3
+    horizon: int = 2
     """actions planned ahead (h)"""
     population: int = 40
     """sequences sampled in the first iteration (N)"""

@@ -23,6 +23,7 @@ from planning.icem import ICEMConfig
 from planning.records import EpisodeLog
 from planning.report import bar_chart, summarise, table
 from planning.setups import Setup, make_setup
+from worldmodel.memory import keep_freed_memory
 
 EPISODE_ENTROPY = 0xE9150DE  # sets the planners' randomness apart from the setups'
 
@@ -109,6 +110,7 @@ class ServoConfig:
 
 def main(config: ServoConfig) -> None:
     """Run what is missing, then report on everything."""
+    keep_freed_memory()
     env = gym.make(
         f"envs:t3vip/Tabletop{config.scene}-v0",
         image_size=config.image_size,

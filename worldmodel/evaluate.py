@@ -12,6 +12,7 @@ from envs import command as command_line
 from envs.errors import UsageError
 from worldmodel.checkpoint import load_model
 from worldmodel.clips import ClipSource
+from worldmodel.memory import keep_freed_memory
 from worldmodel.validation import Scores, ValidationSet, validate
 
 ROWS = (
@@ -62,6 +63,7 @@ class EvaluationOptions:
 
 def main(options: EvaluationOptions) -> None:
     """Score, print, write."""
+    keep_freed_memory()
     dataset = RGBDDataset(options.data)
     results: dict[str, Scores] = {}
     for name in options.models:

@@ -29,6 +29,11 @@ from worldmodel.trunk import STRIDE, Decoder, Encoder, scaled
 Memory = list[LSTMState]
 
 
+def expand(x: Tensor, count: int) -> Tensor:
+    """A batch of one as a batch of `count`, without copying."""
+    return x.expand(count, *x.shape[1:])
+
+
 @dataclass(frozen=True)
 class Prediction:
     """One predicted frame and what it was made of; float32, metres and pixels, camera frame."""
@@ -67,11 +72,8 @@ class WorldState:
     def expand(self, count: int) -> WorldState:
         """The same state `count` times over, for that many candidate futures; the batch must be 1."""
 
-        def repeat(x: Tensor) -> Tensor:
-            return x.expand(count, *x.shape[1:])
-
-        memory = [(repeat(hidden), repeat(cell)) for hidden, cell in self.memory]
-        return WorldState(repeat(self.rgb), repeat(self.depth), memory)
+        memory = [(expand(hidden, count), expand(cell, count)) for hidden, cell in self.memory]
+        return WorldState(expand(self.rgb, count), expand(self.depth, count), memory)
 
 
 class TransformHead(nn.Module):
@@ -169,10 +171,17 @@ class T3VIP(nn.Module):
         return WorldState(rgb[:, -1].float(), depth[:, -1].float(), memory)
 
     def step(
-        self, state: WorldState, action: Tensor | None, latent: Tensor | None = None
+        self, state: WorldState, action: Tensor | None, latent: Tensor | None = None, paint: bool = True
     ) -> tuple[WorldState, Prediction]:
-        """Go one frame onward: action (B, A) in the dataset's units; latent (B, Z, H/8, W/8), zeros when None."""
-        prediction, memory = self.predict(state.rgb, state.depth, action, latent, state.memory)
+        """Go one frame onward.
+
+        Args:
+            state: of a batch of B, or of 1 from which all actions start.
+            action: (B, A) in the dataset's units.
+            latent: (B, Z, H/8, W/8), zeros when None.
+            paint: see `predict`.
+        """
+        prediction, memory = self.predict(state.rgb, state.depth, action, latent, state.memory, paint=paint)
         return WorldState(prediction.rgb, prediction.depth, memory), prediction
 
     def predict(
@@ -183,6 +192,7 @@ class T3VIP(nn.Module):
         latent: Tensor | None,
         memory: Memory,
         still: bool = False,
+        paint: bool = True,
     ) -> tuple[Prediction, Memory]:
         """One frame, one action and a latent to the next frame.
 
@@ -193,11 +203,13 @@ class T3VIP(nn.Module):
             latent: (B, Z, H/8, W/8); zeros when None.
             memory: of the last step, or `blank_memory` at the start.
             still: replace every transform by the identity, to see what is left without motion.
+            paint: run the inpainter. Without it disoccluded pixels keep what was there before, and its memory stands
+                still; a third less work, for planners that look a few frames ahead.
 
         Returns:
             The prediction and the new memory.
         """
-        batch = rgb.shape[0]
+        batch = rgb.shape[0] if action is None else max(rgb.shape[0], action.shape[0])
         near, far = self.camera.near, self.camera.far
         frame = torch.cat((rgb, (depth - near) / (far - near)), dim=1).contiguous(memory_format=torch.channels_last)
         if self.action_dim == 0 or action is None:
@@ -209,24 +221,31 @@ class T3VIP(nn.Module):
 
         device = rgb.device.type
         with torch.autocast(device, self.precision, enabled=self.precision != torch.float32):
-            logits, painted, rotation, translation, memory = self.network(frame, action, latent, memory)
+            logits, painted, rotation, translation, memory = self.network(frame, action, latent, memory, paint)
         if still:
             rotation, translation = torch.eye(3, device=rgb.device).expand_as(rotation), torch.zeros_like(translation)
         with torch.autocast(device, enabled=False):
             masks = torch.softmax(logits.float(), dim=1)
-            prediction = self._render(rgb.float(), depth.float(), masks, rotation, translation, painted.float())
+            rgb, depth = expand(rgb.float(), batch), expand(depth.float(), batch)
+            prediction = self._render(rgb, depth, masks, rotation, translation, painted)
         return prediction, memory
 
     def network(
-        self, frame: Tensor, action: Tensor, latent: Tensor | None, memory: Memory
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Memory]:
+        self, frame: Tensor, action: Tensor, latent: Tensor | None, memory: Memory, paint: bool
+    ) -> tuple[Tensor, Tensor | None, Tensor, Tensor, Memory]:
         """All that is learned: scaled RGB-D frame and normalised action to mask logits, painted RGB-D logits, and the
         rotations and translations of the moving masks."""
-        embedding, skips, encoder_memory = self.encoder(frame, action, latent, memory[:5])
+        features, skips, seen = self.encoder.look(frame, memory[:4])
+        if len(action) > len(frame):  # one past, many futures: what was seen is encoded once
+            count = len(action)
+            features, skips = expand(features, count), (expand(skips[0], count), expand(skips[1], count))
+            seen = [(expand(hidden, count), expand(cell, count)) for hidden, cell in seen]
+            memory = [(expand(hidden, count), expand(cell, count)) for hidden, cell in memory]
+        embedding, acted = self.encoder.act(features, action, latent, memory[4])
         logits, mask_memory = self.mask_decoder(embedding, skips, memory[5:7])
-        painted, paint_memory = self.inpainter(embedding, skips, memory[7:9])
+        painted, paint_memory = self.inpainter(embedding, skips, memory[7:9]) if paint else (None, memory[7:9])
         rotation, translation = self.transforms(embedding, action)
-        return logits, painted, rotation, translation, [*encoder_memory, *mask_memory, *paint_memory]
+        return logits, painted, rotation, translation, [*seen, acted, *mask_memory, *paint_memory]
 
     def blank_memory(self, like: Tensor) -> Memory:
         """Zero states for a batch of frames `like` (B, ..., H, W), in the precision that the network runs in."""
@@ -235,13 +254,12 @@ class T3VIP(nn.Module):
         memory = []
         for channels, stride in layout:
             shape = (like.shape[0], channels, self.camera.height // stride, self.camera.width // stride)
-            zeros = torch.zeros(shape, dtype=self.precision, device=like.device)
-            zeros = zeros.contiguous(memory_format=torch.channels_last)
-            memory.append((zeros, zeros))
+            cell = torch.zeros(shape, device=like.device).contiguous(memory_format=torch.channels_last)
+            memory.append((cell.to(self.precision), cell))
         return memory
 
     def _render(
-        self, rgb: Tensor, depth: Tensor, masks: Tensor, rotation: Tensor, translation: Tensor, painted: Tensor
+        self, rgb: Tensor, depth: Tensor, masks: Tensor, rotation: Tensor, translation: Tensor, painted: Tensor | None
     ) -> Prediction:
         """Transformation layer, splatting layer and RGB-D generator: Eqs. (1) to (5) of the paper."""
         points = geometry.unproject(depth, self.rays)
@@ -257,10 +275,14 @@ class T3VIP(nn.Module):
         )
         occlusion = (coverage < MIN_COVERAGE).float()
         near, far = self.camera.near, self.camera.far
-        paint = torch.sigmoid(painted)
+        if painted is None:
+            painted_rgb, painted_depth = rgb, depth
+        else:
+            painted = torch.sigmoid(painted.float())
+            painted_rgb, painted_depth = painted[:, :3], near + (far - near) * painted[:, 3:]
         return Prediction(
-            rgb=warped[:, :3] * (1 - occlusion) + paint[:, :3] * occlusion,
-            depth=warped[:, 3:].clamp(near, far) * (1 - occlusion) + (near + (far - near) * paint[:, 3:]) * occlusion,
+            rgb=warped[:, :3] * (1 - occlusion) + painted_rgb * occlusion,
+            depth=warped[:, 3:].clamp(near, far) * (1 - occlusion) + painted_depth * occlusion,
             masks=masks,
             points=points,
             transform=transform,

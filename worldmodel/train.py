@@ -14,6 +14,7 @@ from envs import command as command_line
 from envs.errors import UsageError
 from worldmodel.clips import ClipSource
 from worldmodel.config import ModelContext
+from worldmodel.memory import keep_freed_memory
 from worldmodel.options import PRESETS, TrainOptions
 from worldmodel.t3vip import T3VIP
 from worldmodel.trainer import Trainer
@@ -27,6 +28,7 @@ HELD_OUT = 10
 
 def main(options: TrainOptions) -> None:
     """Train."""
+    keep_freed_memory()
     train, validation = _open(options)
     context = _context(train, options)
     if options.model == "t3vip-d":

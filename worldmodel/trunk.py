@@ -42,19 +42,15 @@ class Encoder(nn.Module):
         self.norm3, self.norm4 = layer_norm(middle), layer_norm(middle)
         self.norm5 = layer_norm(large)
 
-    def forward(
-        self, frame: Tensor, action: Tensor, latent: Tensor | None, states: list[LSTMState]
-    ) -> tuple[Tensor, tuple[Tensor, Tensor], list[LSTMState]]:
-        """Encode one frame.
+    def look(self, frame: Tensor, states: list[LSTMState]) -> tuple[Tensor, tuple[Tensor, Tensor], list[LSTMState]]:
+        """The part that knows no action yet, and so is the same for all futures of a frame.
 
         Args:
             frame: (B, inputs, H, W), H and W multiples of 8.
-            action: (B, A), normalised; A may be 0.
-            latent: (B, Z, H/8, W/8) or None for a model without latents.
-            states: of the five LSTMs.
+            states: of the first four LSTMs.
 
         Returns:
-            The motion embedding (B, 128w, H/8, W/8), the skips at 1/2 and 1/4 of the size, the new states.
+            Features (B, 128w, H/8, W/8), the skips at 1/2 and 1/4 of the size, the new states.
         """
         skip0 = self.norm0(F.relu(self.conv0(frame)))
         x, state1 = self.lstm1(skip0, states[0])
@@ -63,11 +59,26 @@ class Encoder(nn.Module):
         x, state3 = self.lstm3(skip1, states[2])
         x, state4 = self.lstm4(self.norm3(x), states[3])
         x = F.relu(self.conv2(self.norm4(x)))
-        tiled = action[:, :, None, None].to(x.dtype).expand(-1, -1, *x.shape[2:])
-        joined = [x, tiled] if latent is None else [x, tiled, latent.to(x.dtype)]
-        x = F.relu(self.join(torch.cat(joined, dim=1)))
-        x, state5 = self.lstm5(x, states[4])
-        return self.norm5(x), (skip0, skip1), [state1, state2, state3, state4, state5]
+        return x, (skip0, skip1), [state1, state2, state3, state4]
+
+    def act(
+        self, features: Tensor, action: Tensor, latent: Tensor | None, state: LSTMState
+    ) -> tuple[Tensor, LSTMState]:
+        """Join what was seen with what is done.
+
+        Args:
+            features: (B, 128w, H/8, W/8), from `look`.
+            action: (B, A), normalised; A may be 0.
+            latent: (B, Z, H/8, W/8) or None for a model without latents.
+            state: of the fifth LSTM.
+
+        Returns:
+            The motion embedding (B, 128w, H/8, W/8) and the new state.
+        """
+        tiled = action[:, :, None, None].to(features.dtype).expand(-1, -1, *features.shape[2:])
+        joined = [features, tiled] if latent is None else [features, tiled, latent.to(features.dtype)]
+        x, state = self.lstm5(F.relu(self.join(torch.cat(joined, dim=1))), state)
+        return self.norm5(x), state
 
 
 class Decoder(nn.Module):

@@ -78,11 +78,11 @@ class T3VIPController(PlanningController):
         @torch.inference_mode()
         def cost(sequences: NDArray) -> NDArray:
             actions = self._tensor(self.aggregated(sequences))  # (N, h, A)
-            future = state.expand(len(sequences))
+            future = state  # one past for all futures: the first step encodes it once
             track = HandTrack.start(points, tcp, intrinsics, len(sequences), self.radius)
             distances = []
             for step in range(actions.shape[1]):
-                future, prediction = self.model.step(future, actions[:, step])
+                future, prediction = self.model.step(future, actions[:, step], paint=False)
                 track = track.advance(prediction.transform, prediction.masks[:, :1])
                 distances.append((track.tcp - goal).norm(dim=-1))
             return discounted_distance(torch.stack(distances, dim=1).cpu().numpy())
