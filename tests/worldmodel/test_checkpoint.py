@@ -152,7 +152,7 @@ def test_a_damaged_checkpoint_is_named(tmp_path, damage):
     run.save(tmp_path, 1)
     folder = tmp_path / "checkpoints" / "step-00000001"
     damage(folder)
-    with pytest.raises(UsageError, match="does not fit .* remove it, or give another --out") as raised:
+    with pytest.raises(UsageError, match=r"does not fit .* remove it, or give another --out") as raised:
         load_training(tmp_path, run.modules, run.optimiser)
     assert str(folder) in str(raised.value) and "\n" not in str(raised.value)
 

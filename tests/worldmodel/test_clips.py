@@ -141,12 +141,12 @@ def test_colour_jitter_changes_colours_only_and_whole_clips_alike(source, starts
     assert changed.depth is clips.depth and changed.actions is clips.actions
     assert torch.equal(changed.rgb[:, 0], changed.rgb[:, 1])
     assert (changed.rgb - still).abs().flatten(1).mean(1).min() > 0.01
-    assert 0 <= changed.rgb.min() and changed.rgb.max() <= 1
+    assert changed.rgb.min() >= 0 and changed.rgb.max() <= 1
     assert jitter_colours(clips, 0.0, np.random.default_rng(0)) is clips
 
 
 def test_clips_that_no_episode_can_hold_are_refused(source, dataset):
-    with pytest.raises(UsageError, match="no episode is 22 frames long, as 8 frames at gap 3 need .* longest has 20"):
+    with pytest.raises(UsageError, match=r"no episode is 22 frames long, as 8 frames at gap 3 need .* longest has 20"):
         source.starts(8)
     with pytest.raises(UsageError, match="frame-gap is 0; give 1"):
         ClipSource(dataset, 0)

@@ -76,7 +76,7 @@ def test_what_a_prediction_says_belongs_together(model, clips):
     np.testing.assert_allclose(prediction.optical_flow.permute(0, 2, 3, 1), landed - camera.pixels(), atol=1e-3)
     assert set(prediction.occlusion.unique().tolist()) == {0.0, 1.0}
     assert camera.near <= prediction.depth.min() and prediction.depth.max() <= camera.far
-    assert 0 <= prediction.rgb.min() and prediction.rgb.max() <= 1 + 1e-5
+    assert prediction.rgb.min() >= 0 and prediction.rgb.max() <= 1 + 1e-5
 
 
 @torch.no_grad()
@@ -94,6 +94,7 @@ def test_the_inpainter_paints_where_no_point_lands_and_nowhere_else(model, clips
 @torch.no_grad()
 def test_memory_is_carried(model, clips):
     """With the same last frame, what was seen before it makes a difference; and it comes from every LSTM."""
+
     def last_step(first):
         rgb = torch.stack((first, clips.rgb[:, 1]), dim=1)
         state = model.observe(rgb, clips.depth[:, :2], clips.actions[:, :1])
@@ -177,7 +178,12 @@ def test_actions_are_normalised_inside(make_model, clips):
     torch.testing.assert_close(first_step(model, raw)[0].transform, expected.transform, atol=1e-5, rtol=1e-5)
 
 
-KINDS = {"t3vip": {}, "t3vip-d": {"latents": "none"}, "per clip": {"latents": "clip"}, "action-free": {"act_cond": False}}
+KINDS = {
+    "t3vip": {},
+    "t3vip-d": {"latents": "none"},
+    "per clip": {"latents": "clip"},
+    "action-free": {"act_cond": False},
+}
 
 
 @pytest.mark.parametrize("kind", KINDS)

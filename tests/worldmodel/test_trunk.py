@@ -41,7 +41,9 @@ def test_layer_norm_is_over_the_whole_picture():
     torch.testing.assert_close(layer_norm(6)(x), F.layer_norm(x, (6, 4, 5)))
 
 
-@pytest.mark.parametrize(("channels", "width", "expected"), [(32, 1.0, 32), (32, 0.5, 16), (32, 0.3, 8), (128, 0.25, 32)])
+@pytest.mark.parametrize(
+    ("channels", "width", "expected"), [(32, 1.0, 32), (32, 0.5, 16), (32, 0.3, 8), (128, 0.25, 32)]
+)
 def test_widths_are_multiples_of_eight(channels, width, expected):
     assert scaled(channels, width) == expected
 
