@@ -38,20 +38,16 @@ def measure(subject: str, cores: int = CORES, environment: Mapping[str, str] | N
     threads = {f"{library}_NUM_THREADS": str(len(chosen)) for library in ("OMP", "MKL", "OPENBLAS")}
     variables = {**os.environ, **threads, "LP_NUM_THREADS": "0", **(environment or {})}
     with tempfile.TemporaryDirectory() as folder:
-        answer = Path(folder) / "answer.json"
+        answer, printed = Path(folder) / "answer.json", Path(folder) / "printed.txt"
         command = [sys.executable, "-m", "tests.benchmarks.child", subject, json.dumps(arguments), str(answer)]
-        ended = subprocess.run(
-            [*command, ",".join(map(str, chosen))],
-            cwd=ROOT,
-            env=variables,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
-        )
+        command.append(",".join(map(str, chosen)))
+        # Into a file: helpers of a killed subject would keep a pipe open, and us waiting.
+        with printed.open("w") as output:
+            ended = subprocess.run(
+                command, cwd=ROOT, env=variables, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
+            )
         if ended.returncode != 0 or not answer.exists():
-            last = "\n".join(ended.stdout.strip().splitlines()[-LAST_LINES:])
+            last = "\n".join(printed.read_text(errors="replace").strip().splitlines()[-LAST_LINES:])
             raise BenchmarkFailed(f"{subject} ended with code {ended.returncode}:\n{last}")
         return json.loads(answer.read_text())
 

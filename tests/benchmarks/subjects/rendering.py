@@ -33,7 +33,10 @@ def tabletop_steps(steps: int, repeats: int) -> float:
 
 
 def robosuite_steps(steps: int, repeats: int) -> float:
-    """Control steps a second of robosuite as it comes: a Panda, operational space control, one camera with depth."""
+    """Control steps a second of robosuite as it comes: a Panda, operational space control, one camera with depth.
+
+    It samples the camera by a clock of its own, at this rate in 24 of 25 steps; only many steps give its true rate.
+    """
     import robosuite  # sets MUJOCO_GL, hence not at the top
 
     env = robosuite.make(
