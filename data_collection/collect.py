@@ -11,7 +11,7 @@ from typing import Literal
 
 from tqdm import tqdm
 
-from data_collection.environments import resolve_env
+from data_collection.environments import resolve_env, versions
 from data_collection.files import locked, remove_leftovers
 from data_collection.manifest import MANIFEST_NAME, Manifest, read_manifest
 from data_collection.schema import SHARD_PATTERN, read_shard
@@ -99,8 +99,9 @@ def _begin(manifest: Manifest, folder: Path) -> None:
             raise UsageError(f"{folder} has shards but no {MANIFEST_NAME}; choose another --out")
     else:
         manifest.check_continues(before, folder)
-    for shard in shards:
-        read_shard(shard)
+    makers = [read_shard(shard).attrs["versions"] for shard in shards]
+    if any(maker != versions() for maker in makers):
+        print(f"warning: {folder} holds episodes made by other versions of the programs", file=sys.stderr)
     if before is None or before.episodes < manifest.episodes:
         manifest.save(folder)
 

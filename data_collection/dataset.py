@@ -92,6 +92,15 @@ class RGBDDataset:
         return [shard.path for shard in self._shards]
 
     @property
+    def makers(self) -> list[dict[str, Any]]:
+        """The different sets of program versions that made the shards; one where nothing changed in between."""
+        makers: list[dict[str, Any]] = []
+        for shard in self._shards:
+            if shard.attrs["versions"] not in makers:
+                makers.append(shard.attrs["versions"])
+        return makers
+
+    @property
     def action_dim(self) -> int:
         """Numbers in an action."""
         return self._shards[0].columns["action"][0]

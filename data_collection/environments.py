@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import json
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-import envs  # noqa: F401  (registers the environments)
+import data_collection
+import envs  # registers the environments
 from envs.errors import UsageError
 from envs.gl import gl_renderer
 
@@ -91,12 +94,21 @@ def describe_env(env: gymnasium.Env, env_id: str, env_kwargs: dict[str, Any]) ->
         "action_scale": [float(unit) for unit in inner.ACTION_SCALE],
         "body_names": list(getattr(inner, "body_names", [])),
         "hand_body_ids": [int(body) for body in getattr(inner, "hand_body_ids", ())],
-        "versions": {package: _version(package) for package in PACKAGES},
+        "versions": versions(),
         "gl_renderer": inner.gl_renderer if hasattr(inner, "gl_renderer") else gl_renderer(),
     }
     if hasattr(inner, "workspace"):
         attrs["workspace"] = [np.asarray(corner, float).tolist() for corner in inner.workspace]
     return attrs
+
+
+def versions() -> dict[str, str | None]:
+    """What an episode depends on beside its options: package versions, and `source`, a hash of this project's code."""
+    digest = hashlib.sha256()
+    for package in (envs, data_collection):
+        for path in sorted(Path(package.__path__[0]).rglob("*.py")):
+            digest.update(path.read_bytes())
+    return {**{package: _version(package) for package in PACKAGES}, "source": digest.hexdigest()[:12]}
 
 
 def _version(package: str) -> str | None:

@@ -78,6 +78,7 @@ def table(report: dict[str, Any]) -> str:
         f"frames        {report['frames']} of {report['image_size'][0]}x{report['image_size'][1]}, "
         f"{report['hours']:g} h, {report['bytes'] / 1e6:.1f} MB",
         f"content hash  {report['content_hash']}",
+        "made by       " + "; ".join(f"source {maker.get('source', 'unknown')}" for maker in report["versions"]),
         "",
         f"{'column':<14}{'shape':<22}{'dtype':<9}{'min':>12}{'max':>12}",
     ]

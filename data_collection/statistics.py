@@ -40,6 +40,7 @@ def describe(dataset: RGBDDataset) -> dict[str, Any]:
         "hours": round((rows - dataset.episodes) / dataset.attrs["control_rate"] / 3600, 3),
         "image_size": [dataset.camera.height, dataset.camera.width],
         "bytes": sum(path.stat().st_size for path in dataset.files),
+        "versions": dataset.makers,
         "content_hash": dataset.content_hash,
         "columns": {name: column_range(dataset, name) for name in dataset.columns},
     }

@@ -33,6 +33,7 @@ from torch import Tensor, nn
 
 from envs.errors import UsageError
 from worldmodel.config import ModelConfig, ModelContext
+from worldmodel.devices import find_device
 from worldmodel.t3vip import T3VIP
 
 Precision = Literal["auto", "float32", "bfloat16"]
@@ -101,16 +102,16 @@ def load_model(name: str | Path, device: str | torch.device = "cpu", precision: 
 
     Args:
         name: see `find_model`.
-        device: where it shall run.
+        device: where it shall run; see `find_device`.
         precision: what its network runs in; `auto` is bfloat16 where the device computes in it, else float32.
 
     Returns:
         The model in evaluation mode.
 
     Raises:
-        UsageError: it is not there or damaged.
+        UsageError: it is not there or damaged, or there is no such device.
     """
-    folder = find_model(name)
+    folder, device = find_model(name), find_device(device)
     try:
         document = json.loads((folder / CONFIG).read_text())
         config, context = dict(document["model"]), dict(document["context"])
@@ -121,7 +122,7 @@ def load_model(name: str | Path, device: str | torch.device = "cpu", precision: 
         raise UsageError(
             f"the model in {folder} cannot be read ({reason}); train it again or restore the folder"
         ) from error
-    model.precision = _best_precision(torch.device(device)) if precision == "auto" else getattr(torch, precision)
+    model.precision = _best_precision(device) if precision == "auto" else getattr(torch, precision)
     return model.to(device).to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
 

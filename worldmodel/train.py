@@ -14,6 +14,7 @@ from envs import command as command_line
 from envs.errors import UsageError
 from worldmodel.clips import ClipSource
 from worldmodel.config import ModelContext
+from worldmodel.devices import find_device
 from worldmodel.memory import keep_freed_memory
 from worldmodel.options import PRESETS, TrainOptions
 from worldmodel.t3vip import T3VIP
@@ -35,7 +36,7 @@ def main(options: TrainOptions) -> None:
         options = replace(options, architecture=replace(options.architecture, latents="none"))
     _claim(options)
     torch.manual_seed(options.seed)
-    device = _device(options.device)
+    device = find_device(options.device)
     model = T3VIP(options.architecture, context).to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     origin = {
         "options": _document(options),
@@ -122,17 +123,6 @@ def _document(options: TrainOptions) -> dict[str, Any]:
     document: dict[str, Any] = json.loads(json.dumps(asdict(options), default=str))
     document.pop("out")
     return document
-
-
-def _device(name: str) -> torch.device:
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        return torch.empty(0, device=name).device
-    except (RuntimeError, AssertionError) as error:
-        raise UsageError(
-            f"device '{name}' is not to be had here ({str(error).splitlines()[0]}); give cpu or cuda"
-        ) from error
 
 
 def _preset(arguments: Sequence[str]) -> TrainOptions:

@@ -189,6 +189,13 @@ def test_environment_that_does_not_observe_depth(tmp_path):
         main(Config(**arguments(tmp_path, env="standin:standin/Blind-v0")))
 
 
+def test_going_on_with_other_programs_is_told(tmp_path, monkeypatch):
+    call("collect-rollouts", options(tmp_path, episodes=1))
+    assert "other versions" not in call("collect-rollouts", options(tmp_path, episodes=1))[2]
+    monkeypatch.setattr("data_collection.collect.versions", lambda: {"source": "changed"})
+    assert "made by other versions" in call("collect-rollouts", options(tmp_path, episodes=1))[2]
+
+
 def test_damaged_shard_stops_resuming(collected, tmp_path):
     main(Config(**arguments(tmp_path, episodes=1)))
     (tmp_path / "shard-00000.h5").write_bytes(b"")

@@ -92,6 +92,19 @@ def test_the_inpainter_paints_where_no_point_lands_and_nowhere_else(model, clips
 
 
 @torch.no_grad()
+def test_without_paint_all_else_is_the_same(model, clips):
+    painted, memory = first_step(model, clips)
+    plain, plain_memory = first_step(model, clips, paint=False)
+    shown = ~painted.occlusion.bool()
+    assert torch.equal(plain.transform, painted.transform) and torch.equal(plain.occlusion, painted.occlusion)
+    assert torch.equal(plain.depth[shown], painted.depth[shown])
+    assert torch.equal(plain.depth[~shown], clips.depth[:, 0][~shown])  # what was there before
+    assert len(plain_memory) == len(memory)
+    assert all(torch.equal(a, b) for a, b in zip(plain_memory[6], memory[6], strict=True))
+    assert not plain_memory[8][0].any() and memory[8][0].any()
+
+
+@torch.no_grad()
 def test_memory_is_carried(model, clips):
     """With the same last frame, what was seen before it makes a difference; and it comes from every LSTM."""
 
@@ -128,6 +141,10 @@ def test_an_expanded_state_is_that_many_copies(model, clips):
     for t in range(2):
         many, prediction = model.step(many, candidates[:, t])
         together.append(prediction)
+    implied, first = model.step(state, candidates[:, 0])  # one state from which all actions start
+    torch.testing.assert_close(first.transform, together[0].transform, atol=1e-4, rtol=1e-4)
+    again = model.step(implied, candidates[:, 1])[1]
+    torch.testing.assert_close(again.transform, together[1].transform, atol=1e-3, rtol=1e-3)
     for n in range(4):
         alone = state
         for t in range(2):
@@ -229,7 +246,7 @@ def test_in_half_precision_only_the_network_is_coarse(make_model, clips):
     exact, _ = first_step(model, clips)
     model.precision = torch.bfloat16
     coarse, memory = first_step(model, clips)
-    assert all(hidden.dtype == cell.dtype == torch.bfloat16 for hidden, cell in memory)
+    assert all(hidden.dtype == torch.bfloat16 and cell.dtype == torch.float32 for hidden, cell in memory)
     for name in ("rgb", "depth", "masks", "transform", "scene_flow", "optical_flow", "occlusion"):
         assert getattr(coarse, name).dtype == torch.float32
     assert not torch.equal(coarse.transform, exact.transform)

@@ -10,13 +10,13 @@ from worldmodel.trunk import Decoder, Encoder, scaled
 HEIGHT, WIDTH = 16, 24
 
 
-def test_gates_are_those_of_an_lstm_cell_with_a_forget_bias_of_one():
+def test_gates_are_those_of_an_lstm_cell():
     torch.manual_seed(0)
     cell = torch.nn.LSTMCell(3, 5)
     x, hidden, memory = torch.randn(2, 3), torch.randn(2, 5), torch.randn(2, 5)
     gates = F.linear(x, cell.weight_ih, cell.bias_ih) + F.linear(hidden, cell.weight_hh, cell.bias_hh)
     enter, forget, candidate, leave = gates.chunk(4, dim=1)  # PyTorch's order
-    ours = torch.cat((enter, candidate, forget - 1, leave), dim=1)[..., None, None]
+    ours = torch.cat((enter, candidate, forget, leave), dim=1)[..., None, None]
     expected = cell(x, (hidden, memory))
     for got, want in zip(lstm_gates(ours, memory[..., None, None]), expected, strict=True):
         torch.testing.assert_close(got[..., 0, 0], want)
@@ -34,6 +34,12 @@ def test_convlstm_reads_its_state_from_the_neighbourhood():
     expected = torch.zeros(6, 6, dtype=torch.bool)
     expected[1:4, 1:4] = True
     assert torch.equal(differs, expected)
+
+
+def test_convlstm_forgets_little_at_first():
+    torch.manual_seed(0)
+    enter, candidate, forget, leave = ConvLSTM(8, 8, kernel=3).gates.bias.chunk(4)
+    assert forget.min() > 0.8 and max(part.abs().max() for part in (enter, candidate, leave)) < 0.2
 
 
 def test_layer_norm_is_over_the_whole_picture():
@@ -62,7 +68,13 @@ def test_encoder_shapes_memory_and_inputs(action_dim, latent_channels):
     action = torch.randn(2, action_dim, requires_grad=True)
     latent = torch.randn(2, 1, HEIGHT // 8, WIDTH // 8, requires_grad=True) if latent_channels else None
     states = blank_states(encoder, 2)
-    embedding, (skip0, skip1), after = encoder(frame, action, latent, states)
+
+    def encode(states):
+        features, skips, seen = encoder.look(frame, states[:4])
+        embedding, acted = encoder.act(features, action, latent, states[4])
+        return embedding, skips, [*seen, acted]
+
+    embedding, (skip0, skip1), after = encode(states)
     small, middle, large = encoder.channels
     assert embedding.shape == (2, large, HEIGHT // 8, WIDTH // 8)
     assert skip0.shape == (2, small, HEIGHT // 2, WIDTH // 2) and skip1.shape == (2, middle, HEIGHT // 4, WIDTH // 4)
@@ -74,7 +86,7 @@ def test_encoder_shapes_memory_and_inputs(action_dim, latent_channels):
     for i in range(5):  # every LSTM's memory is read
         changed = list(states)
         changed[i] = after[i]
-        assert not torch.allclose(encoder(frame, action, latent, changed)[0], embedding, atol=1e-5)
+        assert not torch.allclose(encode(changed)[0], embedding, atol=1e-5)
 
 
 def test_decoder_comes_back_to_the_size_of_the_picture():
