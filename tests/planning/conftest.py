@@ -53,17 +53,18 @@ class ExactModel:
         assert rgb.shape[0] == depth.shape[0] == actions.shape[0] == 1
         assert rgb.shape[1] == depth.shape[1] == actions.shape[1] + 1
         assert rgb.dtype == depth.dtype == actions.dtype == torch.float32
-        return SimpleNamespace(expand=lambda count: count)
+        return None  # one past for all futures
 
-    def step(self, state, action):
+    def step(self, state, action, latent=None, paint=True):
         self.asked.append(action)
-        assert action.shape == (state, self.action_dim)
+        count = len(action)
+        assert action.shape == (count, self.action_dim) and state in (None, count)
         rotation = torch.tensor(self.camera.world_T_camera[:3, :3].tolist())
         shift = 0.02 * action[:, self.channels][:, :3] @ rotation
-        transform = torch.cat([torch.eye(3).expand(state, 3, 3), shift[:, :, None]], dim=2)
-        field_ = transform[..., None, None].expand(state, 3, 4, self.camera.height, self.camera.width)
-        masks = torch.zeros(state, 2, self.camera.height, self.camera.width)  # all that is seen moves
-        return state, SimpleNamespace(transform=field_, masks=masks)
+        transform = torch.cat([torch.eye(3).expand(count, 3, 3), shift[:, :, None]], dim=2)
+        field_ = transform[..., None, None].expand(count, 3, 4, self.camera.height, self.camera.width)
+        masks = torch.zeros(count, 2, self.camera.height, self.camera.width)  # all that is seen moves
+        return count, SimpleNamespace(transform=field_, masks=masks)
 
 
 class ArrayWorld:

@@ -29,8 +29,8 @@ class Shuffled(torch.nn.Module):
     def observe(self, rgb, depth, actions):
         return self.model.observe(rgb, depth, self.exchanged(actions))
 
-    def step(self, state, action):
-        return self.model.step(state, self.exchanged(action))
+    def step(self, state, action, **options):
+        return self.model.step(state, self.exchanged(action), **options)
 
     @staticmethod
     def exchanged(actions):
