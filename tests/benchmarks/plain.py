@@ -20,9 +20,9 @@ class PlainT3VIP(T3VIP):
     """The same network in PyTorch's default memory layout."""
 
     def network(
-        self, frame: Tensor, action: Tensor, latent: Tensor | None, memory: Memory
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Memory]:
-        return super().network(frame.contiguous(), action, latent, memory)
+        self, frame: Tensor, action: Tensor, latent: Tensor | None, memory: Memory, paint: bool
+    ) -> tuple[Tensor, Tensor | None, Tensor, Tensor, Memory]:
+        return super().network(frame.contiguous(), action, latent, memory, paint)
 
     def blank_memory(self, like: Tensor) -> Memory:
         return [(hidden.contiguous(), cell.contiguous()) for hidden, cell in super().blank_memory(like)]

@@ -29,7 +29,9 @@ def options(out, **changed):
 
 def start(command, arguments, **variables):
     """Start a command of the project in a process of its own."""
-    code = f"from {MODULES[command]} import command; command()"
+    # Whoever runs the tests in the background has them ignore Ctrl-C, which the command would inherit.
+    mind = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    code = f"{mind}; from {MODULES[command]} import command; command()"
     environment = {**os.environ, "PYTHONPATH": str(HERE), **{k: str(v) for k, v in variables.items()}}
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, arguments)],

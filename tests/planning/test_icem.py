@@ -45,10 +45,9 @@ def test_samples_are_clipped_to_the_bounds():
 
 
 def test_first_samples_spread_as_asked():
-    planner, cost = make(population=4000, iterations=1, noise_beta=0.0, init_std=0.1), Recorder()
+    planner, cost = make(horizon=5, population=4000, iterations=1, noise_beta=0.0, init_std=0.1), Recorder()
     planner.plan(cost)
-    steps = planner.config.horizon
-    kept_mean = np.sqrt(steps / (steps - 1))  # steps of white noise, and the mean of each series on top
+    kept_mean = np.sqrt(5 / 4)  # five steps of white noise, and the mean of each series on top
     np.testing.assert_allclose(cost.batches[0].std(axis=0), 0.1 * kept_mean, rtol=0.06)
 
 
