@@ -1,6 +1,7 @@
 """The evaluation as a whole: who arrives, what it writes, how it resumes, what it says about mistakes."""
 
 import dataclasses
+import functools
 import json
 import sys
 from types import SimpleNamespace
@@ -43,20 +44,28 @@ def run(capsys, monkeypatch):
     return run
 
 
-def episode(env, name, index, steps=100, kit=None):
-    kit = kit or Kit(env, rng=np.random.default_rng(index))
-    return run_episode(env, make_setup(env, index), CONTROLLERS[name](kit), steps)
+@functools.cache
+def setup_of(env, index):
+    return make_setup(env, index)
+
+
+def episode(env, name, index, steps):
+    kit = Kit(env, rng=np.random.default_rng(index))
+    try:
+        return run_episode(env, setup_of(env, index), CONTROLLERS[name](kit), steps)
+    finally:
+        kit.close()
 
 
 def test_oracle_arrives_and_random_does_not(env):
     for index in range(2):
-        record = episode(env, "oracle", index)
+        record = episode(env, "oracle", index, steps=45)
         assert record.success(0.1, "3d") and record.success(0.1, "2d")
-        assert not episode(env, "random", index).success(0.1, "3d")
+        assert not episode(env, "random", index, steps=45).success(0.1, "3d")
 
 
 def test_proportional_arrives_and_stops_when_nothing_is_left_to_find_out(env):
-    record = episode(env, "proportional", 0)
+    record = episode(env, "proportional", 0, steps=100)
     assert all(record.success(t, space) for t in THRESHOLDS for space in ("2d", "3d"))
     assert record.steps < 100 and len(record.distances) == record.steps
     assert record.final_distance == pytest.approx(record.distances[-1], abs=1e-5)
@@ -64,12 +73,12 @@ def test_proportional_arrives_and_stops_when_nothing_is_left_to_find_out(env):
 
 def test_t3vip_arrives_in_the_simulator_with_an_exact_model(env, make_exact_model, monkeypatch):
     monkeypatch.setattr(checkpoint, "load_model", lambda name, device: make_exact_model(env.unwrapped.camera))
-    assert episode(env, "t3vip", 1).success(0.1, "3d")
+    assert episode(env, "t3vip", 1, steps=45).success(0.1, "3d")
 
 
 def test_pictures_do_not_know_the_goal(env):
     """Bitwise: other goals, and a film that draws the goal, leave what the controller sees as it is."""
-    setup = make_setup(env, 2)
+    setup = setup_of(env, 0)
     elsewhere = dataclasses.replace(setup, goal=Goal(setup.goal.point_world + 0.05, setup.goal.pixel + 3))
     studio = Studio(env)
     seen = []
