@@ -19,7 +19,7 @@ STATIC_CAMERA = {
     "up": (0.404, 0.226, 0.886),  # CALVIN's; not upright, its pictures lean
 }
 SIDE_CAMERA = {"fovy": 24.0, "eye": (-1.05, -2.35, 1.75), "target": (-0.04, -0.12, 0.42), "up": (0.0, 0.0, 1.0)}
-STATIC_DEPTH_RANGE = (3.7, 6.3)  # m, CALVIN's
+STATIC_DEPTH_RANGE = (3.4, 6.3)  # m; CALVIN's 3.7 would cut off a forearm that is stretched towards the camera
 SIDE_DEPTH_RANGE = (1.6, 6.0)  # m
 
 

@@ -20,7 +20,7 @@ from worldmodel.options import PRESETS, TrainOptions
 from worldmodel.t3vip import T3VIP
 from worldmodel.trainer import Trainer
 
-SIZE, NEAR, FAR = 64, 3.7, 6.3  # the tabletop's, pixels and metres
+SIZE, NEAR, FAR = 64, 3.4, 6.3  # the tabletop's, pixels and metres
 ACTION_DIM = 7
 LATE = 0.9  # of the run: clips at full length, no true frames, latents from the inference network, all losses
 
