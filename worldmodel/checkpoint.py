@@ -34,7 +34,8 @@ from torch import Tensor, nn
 from envs.errors import UsageError
 from worldmodel.config import ModelConfig, ModelContext
 from worldmodel.devices import find_device
-from worldmodel.t3vip import T3VIP
+from worldmodel.models import make_model
+from worldmodel.world_model import WorldModel
 
 Precision = Literal["auto", "float32", "bfloat16"]
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -65,7 +66,7 @@ def write_folder(folder: Path, tensors: Mapping[str, Mapping[str, Tensor]], docu
         aside.rename(folder)
 
 
-def save_model(model: T3VIP, folder: Path, origin: Mapping[str, Any]) -> None:
+def save_model(model: WorldModel, folder: Path, origin: Mapping[str, Any]) -> None:
     """Save weights and config for `load_model`.
 
     Args:
@@ -73,7 +74,7 @@ def save_model(model: T3VIP, folder: Path, origin: Mapping[str, Any]) -> None:
     """
     document = {
         "format": 1,
-        "kind": "t3vip",
+        "kind": model.kind,
         "model": asdict(model.config),
         "context": asdict(model.context),
         "origin": dict(origin),
@@ -97,7 +98,7 @@ def find_model(name: str | Path) -> Path:
     )
 
 
-def load_model(name: str | Path, device: str | torch.device = "cpu", precision: Precision = "auto") -> T3VIP:
+def load_model(name: str | Path, device: str | torch.device = "cpu", precision: Precision = "auto") -> WorldModel:
     """Load a world model for use.
 
     Args:
@@ -115,7 +116,8 @@ def load_model(name: str | Path, device: str | torch.device = "cpu", precision: 
     try:
         document = json.loads((folder / CONFIG).read_text())
         config, context = dict(document["model"]), dict(document["context"])
-        model = T3VIP(ModelConfig(**config), ModelContext(**{k: _hashable(v) for k, v in context.items()}))
+        hashable: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in context.items()}
+        model = make_model(document["kind"], ModelConfig(**config), ModelContext(**hashable))
         model.load_state_dict(load_file(folder / WEIGHTS))
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
@@ -133,10 +135,6 @@ def _best_precision(device: torch.device) -> torch.dtype:
     else:
         native = getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)()
     return torch.bfloat16 if native else torch.float32
-
-
-def _hashable(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
 
 
 def save_training(

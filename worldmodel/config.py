@@ -13,16 +13,18 @@ LatentKind = Literal["none", "step", "clip"]
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Architecture of a T3VIP model; the defaults are the paper's."""
+    """Architecture of a model; the defaults are the paper's."""
 
     width: float = 1.0
     """Multiplier on every channel count: 1.0 is the paper's network, 0.5 the CPU preset's."""
     lstm_kernel: int = 5
     """Kernel of the ConvLSTMs."""
     masks: int = 10
-    """K, the number of masks; mask 0 is the background, which never moves."""
+    """K: T3VIP's masks, the first of them the background, which never moves; the rivals' kernels."""
+    kernel_size: int = 9
+    """Of CDNA, SNA and SV2P: width of the kernels in pixels, 5 in the originals."""
     latents: LatentKind = "step"
-    """One latent a step, one a clip, or none (the deterministic T3VIP-D)."""
+    """One latent a step, one a clip, or none; CDNA, SNA and T3VIP-D have none in any case."""
     act_cond: bool = True
     """Whether the model sees actions."""
     splat: SplatMode = "over"
@@ -37,6 +39,8 @@ class ModelConfig:
             raise UsageError(f"width is {self.width}; give a positive multiplier such as 0.5 or 1.0")
         if self.lstm_kernel < 1 or self.lstm_kernel % 2 == 0:
             raise UsageError(f"lstm-kernel is {self.lstm_kernel}; give an odd number such as 3 or 5")
+        if self.kernel_size < 1 or self.kernel_size % 2 == 0:
+            raise UsageError(f"kernel-size is {self.kernel_size}; give an odd number such as 5 or 9")
         if self.masks < 2:
             raise UsageError(f"masks is {self.masks}; give at least 2 (a background and one that moves)")
         if self.splat_sharpness < 0:

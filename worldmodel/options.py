@@ -11,6 +11,7 @@ import tyro
 from envs.errors import UsageError
 from worldmodel.config import ModelConfig
 from worldmodel.losses import LossWeights
+from worldmodel.models import ModelName
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,8 @@ class TrainOptions:
     """Where the other options' values come from."""
     validation: Path | None = None
     """Dataset to validate on; by default the last tenth of the training episodes is held out."""
-    model: Literal["t3vip", "t3vip-d"] = "t3vip"
-    """t3vip-d is T3VIP without latents."""
+    model: ModelName = "t3vip"
+    """t3vip-d is T3VIP without latents; sv2p, sna and cdna are its 2D rivals."""
     architecture: ModelConfig = field(default_factory=ModelConfig)
     """The network."""
     losses: LossWeights = field(default_factory=LossWeights)

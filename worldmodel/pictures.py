@@ -13,7 +13,8 @@ from torch import Tensor
 
 from worldmodel.clips import Clips, ClipTruth
 from worldmodel.rollout import Rollout, unroll
-from worldmodel.t3vip import T3VIP
+from worldmodel.t3vip import CloudPrediction
+from worldmodel.world_model import WorldModel
 
 Image = NDArray[np.uint8]
 FLOW_FULL_M = 0.06
@@ -72,7 +73,7 @@ def _shadow(mask: Tensor) -> Image:
 
 
 def rollout_rows(
-    model: T3VIP, clips: Clips, rollout: Rollout, truth: ClipTruth | None, context: int
+    model: WorldModel, clips: Clips, rollout: Rollout, truth: ClipTruth | None, context: int
 ) -> list[list[Image]]:
     """Rows of pictures of the first clip, one column a predicted step: truth above, prediction below."""
     near, far = model.camera.near, model.camera.far
@@ -81,15 +82,20 @@ def rollout_rows(
     rows = [
         [_rgb(clips.rgb[0, t + 1]) for t in steps],
         [_rgb(p.rgb[0]) for p in made],
-        [depth_colours(clips.depth[0, t + 1], near, far) for t in steps],
-        [depth_colours(p.depth[0], near, far) for p in made],
         [mask_colours(p.masks[0]) for p in made],
+    ]
+    clouds = [prediction for prediction in made if isinstance(prediction, CloudPrediction)]
+    if not clouds:
+        return rows
+    rows[2:2] = [
+        [depth_colours(clips.depth[0, t + 1], near, far) for t in steps],
+        [depth_colours(p.depth[0], near, far) for p in clouds],
     ]
     if truth is not None:
         rows.append([scene_flow_colours(truth.scene_flow[0, t]) for t in steps])
-    rows.append([scene_flow_colours(p.scene_flow[0]) for p in made])
-    rows.append([colour_wheel(p.optical_flow[0], 5.0) for p in made])
-    rows.append([_shadow(p.occlusion[0]) for p in made])
+    rows.append([scene_flow_colours(p.scene_flow[0]) for p in clouds])
+    rows.append([colour_wheel(p.optical_flow[0], 5.0) for p in clouds])
+    rows.append([_shadow(p.occlusion[0]) for p in clouds])
     return rows
 
 
@@ -110,13 +116,13 @@ def tile(rows: list[list[Image]], scale: int = 1, gap: int = 2) -> Image:
 
 @torch.inference_mode()
 def picture_prediction(
-    model: T3VIP, clips: Clips, truth: ClipTruth | None, context: int, path: Path, scale: int = 2
+    model: WorldModel, clips: Clips, truth: ClipTruth | None, context: int, path: Path, scale: int = 2
 ) -> None:
     """Write a PNG of a free-running prediction of the first clip beside the truth.
 
     Rows: true and predicted RGB, true and predicted depth, masks, true (where known) and predicted scene flow,
-    predicted optical flow on the colour wheel, occlusion. Columns: the predicted steps. The true scene flow starts from
-    true frames, the predicted one from predicted frames.
+    predicted optical flow on the colour wheel, occlusion; of a model of pictures RGB and masks only. Columns: the
+    predicted steps. The true scene flow starts from true frames, the predicted one from predicted frames.
     """
     was_training = model.training
     model.eval()

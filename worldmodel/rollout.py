@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from worldmodel.clips import Clips
-from worldmodel.t3vip import T3VIP, Prediction
+from worldmodel.world_model import Prediction, WorldModel
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Rollout:
 
 
 def unroll(
-    model: T3VIP,
+    model: WorldModel,
     clips: Clips,
     context: int,
     latents: Tensor | None = None,
@@ -43,7 +43,7 @@ def unroll(
         latents: (B, T-1, Z, H/8, W/8), or None for zeros.
         truth: probability that a later input is the true frame instead of the predicted one (scheduled sampling).
         generator: draws which.
-        still: render as if every transform were the identity.
+        still: let nothing move.
     """
     rgb, depth = clips.rgb[:, 0], clips.depth[:, 0]
     memory = model.blank_memory(rgb)
@@ -54,13 +54,14 @@ def unroll(
         latent = None if latents is None else latents[:, t]
         prediction, memory = model.predict(rgb, depth, clips.actions[:, t], latent, memory, still=still)
         predictions.append(prediction)
+        predicted_depth = depth if prediction.depth is None else prediction.depth
         if t + 1 < context or truth >= 1:
             rgb, depth = clips.rgb[:, t + 1], clips.depth[:, t + 1]
         elif truth <= 0:
-            rgb, depth = prediction.rgb, prediction.depth
+            rgb, depth = prediction.rgb, predicted_depth
         else:
             chance = torch.rand((rgb.shape[0], 1, 1, 1), generator=generator)
             true = (chance < truth).to(rgb.device)
             rgb = torch.where(true, clips.rgb[:, t + 1], prediction.rgb)
-            depth = torch.where(true, clips.depth[:, t + 1], prediction.depth)
+            depth = torch.where(true, clips.depth[:, t + 1], predicted_depth)
     return Rollout(predictions, torch.stack(inputs, dim=1))

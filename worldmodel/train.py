@@ -16,8 +16,8 @@ from worldmodel.clips import ClipSource
 from worldmodel.config import ModelContext
 from worldmodel.devices import find_device
 from worldmodel.memory import keep_freed_memory
+from worldmodel.models import make_model, named_config
 from worldmodel.options import PRESETS, TrainOptions
-from worldmodel.t3vip import T3VIP
 from worldmodel.trainer import Trainer
 from worldmodel.validation import ValidationSet
 
@@ -32,12 +32,12 @@ def main(options: TrainOptions) -> None:
     keep_freed_memory()
     train, validation = _open(options)
     context = _context(train, options)
-    if options.model == "t3vip-d":
-        options = replace(options, architecture=replace(options.architecture, latents="none"))
+    kind, architecture = named_config(options.model, options.architecture)
+    options = replace(options, architecture=architecture)
     _claim(options)
     torch.manual_seed(options.seed)
     device = find_device(options.device)
-    model = T3VIP(options.architecture, context).to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    model = make_model(kind, architecture, context).to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     origin = {
         "options": _document(options),
         "data": {"train": train.dataset.content_hash, "validation": validation.source.dataset.content_hash},

@@ -28,6 +28,7 @@ from worldmodel.pictures import picture_prediction
 from worldmodel.rollout import Rollout, unroll
 from worldmodel.t3vip import T3VIP
 from worldmodel.validation import ValidationSet, summary, validate
+from worldmodel.world_model import WorldModel
 
 logger = logging.getLogger(__name__)
 MAX_BAD_STEPS = 10
@@ -45,7 +46,12 @@ class Trainer:
     """
 
     def __init__(
-        self, model: T3VIP, options: TrainOptions, train: ClipSource, validation: ValidationSet, origin: dict[str, Any]
+        self,
+        model: WorldModel,
+        options: TrainOptions,
+        train: ClipSource,
+        validation: ValidationSet,
+        origin: dict[str, Any],
     ) -> None:
         self.model, self.options, self.train_clips, self.validation = model, options, train, validation
         self.origin = origin
@@ -55,7 +61,9 @@ class Trainer:
         self.inference: InferenceNetwork | None = None
         if model.latent_channels:
             per_clip = model.config.latents == "clip"
-            self.inference = InferenceNetwork(4, model.latent_channels, model.config.width, per_clip).to(self.device)
+            self.inference = InferenceNetwork(
+                model.frame_channels, model.latent_channels, model.config.width, per_clip
+            ).to(self.device)
             self.modules["inference"] = self.inference
         parameters = [p for module in self.modules.values() for p in module.parameters()]
         self.parameters = parameters
@@ -171,8 +179,7 @@ class Trainer:
         draws = draws.expand(-1, steps, -1, -1, -1).to(self.device)
         if self.progress < self.options.schedule.posterior_from:
             return draws, None
-        near, far = self.model.camera.near, self.model.camera.far
-        frames = torch.cat((clips.rgb, (clips.depth - near) / (far - near)), dim=2)
+        frames = self.model.frame(clips.rgb, clips.depth)
         with torch.autocast(self.device.type, self.model.precision, enabled=self.model.precision != torch.float32):
             mean, log_variance = self.inference(frames)
         pixels = self.model.camera.height * self.model.camera.width
@@ -207,12 +214,17 @@ class Trainer:
 
 
 def reconstruction_terms(
-    model: T3VIP, rollout: Rollout, clips: Clips, weights: losses.LossWeights
+    model: WorldModel, rollout: Rollout, clips: Clips, weights: losses.LossWeights
 ) -> dict[str, Tensor]:
-    """All terms but the KL, over all predictions of a rollout at once; a term of weight 0 is left out."""
+    """All terms but the KL, over all predictions of a rollout at once; a term of weight 0 is left out.
+
+    A model of pictures has the first of them only.
+    """
     terms: dict[str, Tensor] = {}
     if weights.rgb:
         terms["rgb"] = losses.reconstruction(rollout.stack("rgb"), clips.rgb[:, 1:], weights.power)
+    if not isinstance(model, T3VIP):
+        return terms
     if weights.depth:
         terms["depth"] = losses.reconstruction(rollout.stack("depth"), clips.depth[:, 1:], weights.power)
     if weights.knn:

@@ -13,8 +13,9 @@ from torch import Tensor
 from worldmodel.clips import Clips, ClipSource, ClipTruth
 from worldmodel.metrics import flow_scores, psnr_per_step, rmse_per_step
 from worldmodel.rollout import Rollout, unroll
-from worldmodel.t3vip import T3VIP
+from worldmodel.t3vip import T3VIP, CloudPrediction
 from worldmodel.tracking import HandTrack
+from worldmodel.world_model import WorldModel
 
 Scores = dict[str, float | list[float]]
 MIN_WAY_M = 0.03
@@ -47,7 +48,7 @@ class ValidationSet:
 
 
 @torch.inference_mode()
-def validate(model: T3VIP, data: ValidationSet, still: bool = False) -> Scores:
+def validate(model: WorldModel, data: ValidationSet, still: bool = False) -> Scores:
     """Score free-running prediction with latents at 0, and motion where the dataset knows it.
 
     Args:
@@ -56,10 +57,10 @@ def validate(model: T3VIP, data: ValidationSet, still: bool = False) -> Scores:
         still: pretend that every transform is the identity; the scores must then be those of copying.
 
     Returns:
-        Per predicted step after the context: `psnr`, `copy_psnr` (dB), `depth_rmse`, `copy_depth_rmse` (metres).
-        Means: `inpainted` (share of pixels), `score` (RGB PSNR plus depth PSNR in dB, the paper's tuning metric). With
-        ground truth also the terms of `flow_scores`, one step ahead of true frames, and `tracking_error`: how far the
-        moved TCP is off at the end of the clip, over how far it really went.
+        Per predicted step after the context: `psnr`, `copy_psnr` (dB), and of T3VIP `depth_rmse`, `copy_depth_rmse`
+        (metres). Means: `score` (RGB PSNR, of T3VIP plus depth PSNR, in dB: the paper's tuning metric); of T3VIP
+        `inpainted` (share of pixels) and, with ground truth, the terms of `flow_scores`, one step ahead of true frames,
+        and `tracking_error`: how far the moved TCP is off at the end of the clip, over how far it really went.
     """
     was_training = model.training
     model.eval()
@@ -72,8 +73,10 @@ def validate(model: T3VIP, data: ValidationSet, still: bool = False) -> Scores:
         clips = clips.to(device)
         free = unroll(model, clips, c, still=still)
         predicted_rgb.append(free.stack("rgb")[:, c - 1 :].cpu())
-        predicted_depth.append(free.stack("depth")[:, c - 1 :].cpu())
         rgb.append(clips.rgb[:, c - 1 :].cpu())
+        if not isinstance(model, T3VIP):
+            continue
+        predicted_depth.append(free.stack("depth")[:, c - 1 :].cpu())
         depth.append(clips.depth[:, c - 1 :].cpu())
         inpainted.append(free.stack("occlusion")[:, c - 1 :].mean((1, 2, 3, 4)).cpu())
         if data.source.dataset.has_ground_truth:
@@ -83,14 +86,19 @@ def validate(model: T3VIP, data: ValidationSet, still: bool = False) -> Scores:
             flows.append((flow, truth.scene_flow[:, c - 1 :], truth.hand[:, c - 1 :]))
             tracked.append(_track(model, clips, truth, free, c))
     model.train(was_training)
-    all_rgb, all_depth = torch.cat(rgb), torch.cat(depth)
-    camera = model.camera
-    depth_rmse = rmse_per_step(torch.cat(predicted_depth), all_depth[:, 1:])
+    all_rgb = torch.cat(rgb)
     psnr = psnr_per_step(torch.cat(predicted_rgb), all_rgb[:, 1:])
-    depth_psnr = 20 * torch.log10((camera.far - camera.near) / depth_rmse.clamp(min=1e-9))
     scores: Scores = {
         "psnr": psnr.tolist(),
         "copy_psnr": psnr_per_step(all_rgb[:, :1].expand_as(all_rgb[:, 1:]), all_rgb[:, 1:]).tolist(),
+        "score": float(psnr.mean()),
+    }
+    if not isinstance(model, T3VIP):
+        return scores
+    all_depth, camera = torch.cat(depth), model.camera
+    depth_rmse = rmse_per_step(torch.cat(predicted_depth), all_depth[:, 1:])
+    depth_psnr = 20 * torch.log10((camera.far - camera.near) / depth_rmse.clamp(min=1e-9))
+    scores |= {
         "depth_rmse": depth_rmse.tolist(),
         "copy_depth_rmse": rmse_per_step(all_depth[:, :1].expand_as(all_depth[:, 1:]), all_depth[:, 1:]).tolist(),
         "inpainted": float(torch.cat(inpainted).mean()),
@@ -112,6 +120,7 @@ def _track(model: T3VIP, clips: Clips, truth: ClipTruth, free: Rollout, context:
     for b in range(len(points)):
         track = HandTrack.start(points[b], truth.tcp[b, context - 1].to(points), model.intrinsics, 1)
         for prediction in free.predictions[context - 1 :]:
+            assert isinstance(prediction, CloudPrediction)
             track = track.advance(prediction.transform[b : b + 1], prediction.masks[b : b + 1, :1])
         ends.append(track.tcp[0].cpu())
     error = (torch.stack(ends) - truth.tcp[:, -1]).norm(dim=1)
@@ -120,18 +129,19 @@ def _track(model: T3VIP, clips: Clips, truth: ClipTruth, free: Rollout, context:
 
 def summary(scores: Scores) -> str:
     """One line for people: gains over copying at the first and last step, and the motion scores."""
-    psnr, copy = scores["psnr"], scores["copy_psnr"]
-    depth, copy_depth = scores["depth_rmse"], scores["copy_depth_rmse"]
-    assert (
-        isinstance(psnr, list) and isinstance(copy, list) and isinstance(depth, list) and isinstance(copy_depth, list)
-    )
-    line = (
-        f"PSNR {psnr[0]:.1f} ({psnr[0] - copy[0]:+.1f}) to {psnr[-1]:.1f} ({psnr[-1] - copy[-1]:+.1f} dB over copy), "
-        f"depth RMSE {depth[-1] / copy_depth[-1]:.2f} of copying's, inpainted {100 * float(scores['inpainted']):.1f} %"  # type: ignore[arg-type]
-    )
+    psnr, copy = _steps(scores["psnr"]), _steps(scores["copy_psnr"])
+    line = f"PSNR {psnr[0]:.1f} ({psnr[0] - copy[0]:+.1f}) to {psnr[-1]:.1f} ({psnr[-1] - copy[-1]:+.1f} dB over copy)"
+    if "depth_rmse" in scores:
+        share = _steps(scores["depth_rmse"])[-1] / _steps(scores["copy_depth_rmse"])[-1]
+        line += f", depth RMSE {share:.2f} of copying's, inpainted {100 * float(scores['inpainted']):.1f} %"  # type: ignore[arg-type]
     if "flow_error_moving" in scores:
         line += (
             f", flow error {scores['flow_error_moving']:.2f} (hand {scores['flow_error_hand']:.2f}), false flow "
             f"{1000 * float(scores['false_flow_m']):.2f} mm, tracking error {scores['tracking_error']:.2f}"  # type: ignore[arg-type]
         )
     return line
+
+
+def _steps(values: float | list[float]) -> list[float]:
+    assert isinstance(values, list)
+    return values

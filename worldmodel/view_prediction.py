@@ -13,7 +13,7 @@ from envs.errors import UsageError
 from worldmodel.checkpoint import load_model
 from worldmodel.clips import ClipSource
 from worldmodel.pictures import picture_prediction
-from worldmodel.t3vip import T3VIP
+from worldmodel.world_model import WorldModel
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def _start(source: ClipSource, options: ViewOptions) -> np.ndarray:
     return starts[[int(np.argmax(changes))]]
 
 
-def _check_fits(dataset: RGBDDataset, model: T3VIP, options: ViewOptions) -> None:
+def _check_fits(dataset: RGBDDataset, model: WorldModel, options: ViewOptions) -> None:
     for name, ours, theirs in (
         ("action size", model.context.action_dim, dataset.action_dim),
         ("image size", (model.camera.height, model.camera.width), (dataset.camera.height, dataset.camera.width)),

@@ -11,7 +11,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from worldmodel import geometry, losses
-from worldmodel.t3vip import T3VIP, Memory
+from worldmodel.blocks import LSTMState
+from worldmodel.t3vip import T3VIP, Heads
+from worldmodel.world_model import Memory
 
 BEYOND_M = 1e4  # where the cloud ends: farther away than any true neighbour
 
@@ -20,12 +22,13 @@ class PlainT3VIP(T3VIP):
     """The same network in PyTorch's default memory layout."""
 
     def network(
-        self, frame: Tensor, action: Tensor, latent: Tensor | None, memory: Memory, paint: bool
-    ) -> tuple[Tensor, Tensor | None, Tensor, Tensor, Memory]:
-        return super().network(frame.contiguous(), action, latent, memory, paint)
+        self, frame: Tensor, action: Tensor, latent: Tensor | None, states: list[LSTMState], paint: bool
+    ) -> tuple[Heads, list[LSTMState]]:
+        return super().network(frame.contiguous(), action, latent, states, paint)
 
     def blank_memory(self, like: Tensor) -> Memory:
-        return [(hidden.contiguous(), cell.contiguous()) for hidden, cell in super().blank_memory(like)]
+        states = super().blank_memory(like).states
+        return Memory([(hidden.contiguous(), cell.contiguous()) for hidden, cell in states])
 
 
 @contextlib.contextmanager

@@ -99,6 +99,7 @@ def test_without_paint_all_else_is_the_same(model, clips):
     assert torch.equal(plain.transform, painted.transform) and torch.equal(plain.occlusion, painted.occlusion)
     assert torch.equal(plain.depth[shown], painted.depth[shown])
     assert torch.equal(plain.depth[~shown], clips.depth[:, 0][~shown])  # what was there before
+    plain_memory, memory = plain_memory.states, memory.states
     assert len(plain_memory) == len(memory)
     assert all(torch.equal(a, b) for a, b in zip(plain_memory[6], memory[6], strict=True))
     assert not plain_memory[8][0].any() and memory[8][0].any()
@@ -116,8 +117,8 @@ def test_memory_is_carried(model, clips):
     state, (after, prediction) = last_step(clips.rgb[:, 0])
     _, (_, other) = last_step(clips.rgb[:, 0].flip(1))
     assert (prediction.rgb - other.rgb).abs().max() > 1e-3
-    assert len(state.memory) == 9 and len(after.memory) == 9
-    for (hidden, cell), (later_hidden, later_cell) in zip(state.memory, after.memory, strict=True):
+    assert len(state.memory.states) == 9 and len(after.memory.states) == 9
+    for (hidden, cell), (later_hidden, later_cell) in zip(state.memory.states, after.memory.states, strict=True):
         assert hidden.abs().max() > 0 and cell.abs().max() > 0
         assert not torch.equal(hidden, later_hidden) and not torch.equal(cell, later_cell)
 
@@ -246,7 +247,7 @@ def test_in_half_precision_only_the_network_is_coarse(make_model, clips):
     exact, _ = first_step(model, clips)
     model.precision = torch.bfloat16
     coarse, memory = first_step(model, clips)
-    assert all(hidden.dtype == torch.bfloat16 and cell.dtype == torch.float32 for hidden, cell in memory)
+    assert all(hidden.dtype == torch.bfloat16 and cell.dtype == torch.float32 for hidden, cell in memory.states)
     for name in ("rgb", "depth", "masks", "transform", "scene_flow", "optical_flow", "occlusion"):
         assert getattr(coarse, name).dtype == torch.float32
     assert not torch.equal(coarse.transform, exact.transform)
