@@ -14,6 +14,7 @@ from worldmodel.compilation import compiled
 EDGE_SHARPNESS = 10.0
 """How fast smoothness lets go at an edge of a picture in [0, 1]; with the paper's 1 an edge hardly counts."""
 _BEYOND_M = 1e4  # where the cloud ends: farther away than any true neighbour
+_DISTANCES_AT_ONCE = 1 << 22  # of the chamfer distance: 16 MiB of them
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,9 @@ class LossWeights:
     """lambda_6, divergence of the latents from the prior, nats a pixel."""
     power: Literal[1, 2] = 1
     """alpha: 1 for absolute, 2 for squared reconstruction errors."""
+    alignment: Literal["knn", "chamfer"] = "knn"
+    """Where a point's nearest neighbour is sought: in a window about its pixel, or (Hind4sight-Net's chamfer distance)
+    in the whole cloud, which takes many times longer."""
     knn_radius: int = 5
     """The nearest neighbour is sought this many pixels to every side."""
 
@@ -100,16 +104,63 @@ def nearest_in_window(query: Tensor, reference: Tensor, radius: int) -> Tensor:
         return y * width + x
 
 
-def knn_distance(query: Tensor, reference: Tensor, radius: int) -> Tensor:
-    """Mean distance of each query point to its nearest reference point within the window, metres: Eqs. (8), (9)."""
-    index = nearest_in_window(query, reference, radius).flatten(1).unsqueeze(1).expand(-1, 3, -1)
+def nearest_of_all(query: Tensor, reference: Tensor) -> Tensor:
+    """The nearest reference point of each query point in the whole cloud.
+
+    Some rows of the matrix of distances at a time; the distances themselves, not |a|^2 + |b|^2 - 2ab, which at 4 m is
+    off by millimetres.
+
+    Args:
+        query: (B, 3, H, W) metres.
+        reference: (B, 3, H, W) metres.
+
+    Returns:
+        (B, H, W) int64, the flat index y * W + x of the nearest reference point.
+    """
+    batch, _, height, width = query.shape
+    rows = max(1, _DISTANCES_AT_ONCE // (height * width))
+    with torch.no_grad():
+        points, others = (cloud.detach().flatten(2).transpose(1, 2).contiguous() for cloud in (query, reference))
+        nearest = [
+            torch.cdist(part, others[b], compute_mode="donot_use_mm_for_euclid_dist").argmin(1)
+            for b in range(batch)
+            for part in points[b].split(rows)
+        ]
+        return torch.cat(nearest).view(batch, height, width)
+
+
+def _mean_distance(query: Tensor, reference: Tensor, nearest: Tensor) -> Tensor:
+    """Mean distance of each query point to the reference point with its index (B, H, W), metres."""
+    index = nearest.flatten(1).unsqueeze(1).expand(-1, 3, -1)
     neighbours = reference.flatten(2).gather(2, index)
     return ((query.flatten(2) - neighbours).square().sum(1) + 1e-12).sqrt().mean()
+
+
+def knn_distance(query: Tensor, reference: Tensor, radius: int) -> Tensor:
+    """Mean distance of each query point to its nearest reference point within the window, metres: Eqs. (8), (9)."""
+    return _mean_distance(query, reference, nearest_in_window(query, reference, radius))
 
 
 def knn_alignment(moved: Tensor, target: Tensor, radius: int) -> Tensor:
     """Both directions of the point cloud alignment: Eq. (10), `(B, 3, H, W)` metres each."""
     return knn_distance(moved, target, radius) + knn_distance(target, moved, radius)
+
+
+def chamfer_distance(query: Tensor, reference: Tensor) -> Tensor:
+    """Mean distance of each query point to its nearest reference point anywhere, metres."""
+    return _mean_distance(query, reference, nearest_of_all(query, reference))
+
+
+def chamfer_alignment(moved: Tensor, target: Tensor) -> Tensor:
+    """`knn_alignment` with the whole picture for a window: what the paper's section III-D compares itself with."""
+    return chamfer_distance(moved, target) + chamfer_distance(target, moved)
+
+
+def alignment(moved: Tensor, target: Tensor, weights: LossWeights) -> Tensor:
+    """The point cloud alignment that the options ask for, `(B, 3, H, W)` metres each."""
+    if weights.alignment == "chamfer":
+        return chamfer_alignment(moved, target)
+    return knn_alignment(moved, target, weights.knn_radius)
 
 
 def edge_aware_smoothness(flow: Tensor, rgb: Tensor) -> Tensor:

@@ -74,6 +74,9 @@ class TrainOptions:
     """Frames that the model sees before it predicts."""
     steps: int = 200_000
     """Updates of the weights."""
+    minutes: float | None = None
+    """Instead of `steps`: as many as fill this time on this machine, validation and checkpoints included. Found by a
+    trial before the first step and written down; a run that goes on keeps the number."""
     batch: int = 16
     """Clips a step."""
     learning_rate: float = 1e-3
@@ -101,6 +104,8 @@ class TrainOptions:
         for name in ("steps", "batch", "validate_every", "validation_clips", "save_every", "log_every", "frame_gap"):
             if getattr(self, name) < 1:
                 raise UsageError(f"{name.replace('_', '-')} is {getattr(self, name)}; give at least 1")
+        if self.minutes is not None and not self.minutes > 0:
+            raise UsageError(f"minutes is {self.minutes}; give a positive number such as 20, or --steps instead")
         if self.learning_rate <= 0:
             raise UsageError(f"learning-rate is {self.learning_rate}; give a positive number such as 1e-3")
         shortest = min(frames for _, frames in self.schedule.clip_lengths)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
 import torch
 
 from data_collection.dataset import RGBDDataset
+from data_collection.files import write_json
 from envs import command as command_line
 from envs.errors import UsageError
+from worldmodel.budget import measure_cost
 from worldmodel.clips import ClipSource
 from worldmodel.config import ModelContext
 from worldmodel.devices import find_device
@@ -34,16 +36,31 @@ def main(options: TrainOptions) -> None:
     context = _context(train, options)
     kind, architecture = named_config(options.model, options.architecture)
     options = replace(options, architecture=architecture)
-    _claim(options)
-    torch.manual_seed(options.seed)
     device = find_device(options.device)
-    model = make_model(kind, architecture, context).to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    origin = {
-        "options": _document(options),
-        "data": {"train": train.dataset.content_hash, "validation": validation.source.dataset.content_hash},
-        "versions": {"torch": torch.__version__},
-    }
-    Trainer(model, options, train, validation, origin).run()
+    hashes = {"train": train.dataset.content_hash, "validation": validation.source.dataset.content_hash}
+
+    def make_trainer(options: TrainOptions) -> Trainer:
+        torch.manual_seed(options.seed)
+        model = make_model(kind, architecture, context).to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        origin = {"options": _document(options), "data": hashes, "versions": {"torch": torch.__version__}}
+        return Trainer(model, options, train, validation, origin)
+
+    options = _claimed(options) or _claim(_timed(options, make_trainer))
+    make_trainer(options).run()
+
+
+def _timed(options: TrainOptions, make_trainer: Callable[[TrainOptions], Trainer]) -> TrainOptions:
+    """The options with the number of steps that fill the given minutes, if minutes are given."""
+    if options.minutes is None:
+        return options
+    cost = measure_cost(make_trainer, options)
+    options = replace(options, steps=cost.steps_in(60 * options.minutes, options))
+    print(
+        f"{options.minutes:g} minutes are {options.steps} steps here: {cost.step:.3f} s a step over the run, "
+        f"{cost.validation:.1f} s a validation, {cost.checkpoint:.1f} s a checkpoint",
+        flush=True,
+    )
+    return options
 
 
 def _open(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
@@ -97,26 +114,32 @@ def _context(train: ClipSource, options: TrainOptions) -> ModelContext:
     )
 
 
-def _claim(options: TrainOptions) -> None:
-    """Write the options beside the run, or check that the run there is this one."""
+def _claimed(options: TrainOptions) -> TrainOptions | None:
+    """The options of the run that the folder holds, which must be those given; None where there is no run yet."""
     path = options.out / "config.json"
+    if not path.exists():
+        return None
+    try:
+        before = dict(json.loads(path.read_text()))
+        if options.minutes is not None:  # then the number of steps is the run's own
+            options = replace(options, steps=int(before["steps"]))
+    except (ValueError, TypeError, KeyError) as error:
+        raise UsageError(f"{path} is damaged ({error}); restore it, or give another --out") from error
     document = _document(options)
-    if path.exists():
-        try:
-            before = dict(json.loads(path.read_text()))
-        except (ValueError, TypeError) as error:
-            raise UsageError(f"{path} is damaged ({error}); restore it, or give another --out") from error
-        for name in document:
-            if name != "device" and before.get(name) != document[name]:
-                raise UsageError(
-                    f"{options.out} holds a run with {name} = {before.get(name)}, not {document[name]}; give the same "
-                    "options to go on with it, or another --out"
-                )
-        return
+    for name in document:
+        if name != "device" and before.get(name) != document[name]:
+            raise UsageError(
+                f"{options.out} holds a run with {name} = {before.get(name)}, not {document[name]}; give the same "
+                "options to go on with it, or another --out"
+            )
+    return options
+
+
+def _claim(options: TrainOptions) -> TrainOptions:
+    """Write the options beside the run; returns them."""
     options.out.mkdir(parents=True, exist_ok=True)
-    aside = path.with_suffix(".tmp")
-    aside.write_text(json.dumps(document, indent=2) + "\n")
-    aside.replace(path)
+    write_json(options.out / "config.json", _document(options))
+    return options
 
 
 def _document(options: TrainOptions) -> dict[str, Any]:

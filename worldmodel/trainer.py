@@ -87,7 +87,7 @@ class Trainer:
             while self.step < options.steps:
                 self.model.train()
                 asked = time.monotonic()
-                clips = self._next_clips()
+                clips = self.next_clips()
                 waited += time.monotonic() - asked
                 terms = self.update(clips)
                 self.step += 1
@@ -99,9 +99,9 @@ class Trainer:
                     share = waited / max(time.monotonic() - started, 1e-9)
                     self._log(writer, "train", terms | {"seconds": self.seconds, "data_wait": share})
                 if self.step % options.validate_every == 0 or last:
-                    self._validate(writer, bar)
+                    self.score(writer, bar)
                 if self.step % options.save_every == 0 or last or stopping():
-                    self._save()
+                    self.save()
                 if stopping():
                     bar.write(f"stopped at step {self.step}; the same command goes on from here")
                     break
@@ -164,7 +164,8 @@ class Trainer:
         fall = 0.5 * (1 + math.cos(math.pi * _ramp(self.progress, schedule.warmup, 1.0)))
         return self.options.learning_rate * rise * (schedule.final_rate + (1 - schedule.final_rate) * fall)
 
-    def _next_clips(self) -> Clips:
+    def next_clips(self) -> Clips:
+        """The clips of this step."""
         rng = np.random.default_rng((self.options.seed, self.step))
         frames = self.options.schedule.clip_length(self.progress)
         clips = self.train_clips.sample(rng, self.options.batch, frames)
@@ -185,7 +186,8 @@ class Trainer:
         pixels = self.model.camera.height * self.model.camera.width
         return mean + (0.5 * log_variance).exp() * draws, losses.kl_to_prior(mean, log_variance, pixels)
 
-    def _validate(self, writer: SummaryWriter, bar: tqdm[Any]) -> None:
+    def score(self, writer: SummaryWriter, bar: tqdm[Any]) -> None:
+        """Validate, draw a picture, and keep the model if it is the best so far."""
         scores = validate(self.model, self.validation)
         self._log(writer, "validation", scores)
         bar.write(f"step {self.step}: {summary(scores)}")
@@ -201,7 +203,8 @@ class Trainer:
             origin = self.origin | {"step": self.step, "seconds": round(self.seconds), "validation": scores}
             save_model(self.model, self.options.out / "model", origin)
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """Write a checkpoint to go on from."""
         state = {"step": self.step, "best": self.best, "seconds": self.seconds}
         save_training(self.options.out, self.modules, self.optimiser, state)
 
@@ -230,7 +233,7 @@ def reconstruction_terms(
     if weights.knn:
         target = clips.depth[:, 1:] * model.rays
         moved = rollout.stack("moved_points")
-        terms["knn"] = losses.knn_alignment(moved.flatten(0, 1), target.flatten(0, 1), weights.knn_radius)
+        terms["knn"] = losses.alignment(moved.flatten(0, 1), target.flatten(0, 1), weights)
     pictures = rollout.input_rgb.detach().flatten(0, 1)
     if weights.scene_smoothness:
         flow = rollout.stack("scene_flow").flatten(0, 1)

@@ -78,7 +78,7 @@ def test_plain_training_step_has_the_same_losses():
         torch.nn.init.normal_(
             trainer.model.transforms.last.weight, std=0.01, generator=torch.Generator().manual_seed(0)
         )
-        clips = trainer._next_clips()
+        clips = trainer.next_clips()
         if kind == "plain":
             with plain.plain_operators():
                 terms[kind] = trainer.objective(clips)[1]

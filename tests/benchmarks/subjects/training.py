@@ -28,11 +28,11 @@ LATE = 0.9  # of the run: clips at full length, no true frames, latents from the
 def step_seconds(kind: str, preset: str, repeats: int) -> dict[str, float]:
     """Median seconds of an update ("update"), and of waiting for its clips ("wait")."""
     trainer = make_trainer(kind, preset)
-    clips = trainer._next_clips()
+    clips = trainer.next_clips()
     trainer.model.train()
     with plain_operators() if kind == "plain" else contextlib.nullcontext():
         update = median_seconds(lambda: trainer.update(clips), repeats)
-    return {"update": update, "wait": median_seconds(trainer._next_clips, repeats)}
+    return {"update": update, "wait": median_seconds(trainer.next_clips, repeats)}
 
 
 def make_trainer(kind: str, preset: str, **changes: Any) -> Trainer:
