@@ -57,8 +57,9 @@ def light_mesh(paths: Sequence[Path], max_faces: int = 500) -> Mesh:
 
 
 def cache_dir() -> Path:
-    """Where derived files live: `$XDG_CACHE_HOME/t3vip`, else `~/.cache/t3vip`."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "t3vip"
+    """Where derived files live: `$T3VIP_CACHE`, else `$XDG_CACHE_HOME/t3vip`, else `~/.cache/t3vip`."""
+    own = os.environ.get("T3VIP_CACHE")
+    return Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "t3vip"
 
 
 def read_mesh(path: Path) -> Mesh:

@@ -7,6 +7,7 @@
       model/                      the best model so far by validation score; what `load_model` reads
         config.json               architecture, context, and where it came from
         model.safetensors
+        inference.safetensors     of a model with latents: the inference network, for evaluation only; may be missing
       checkpoints/step-00001000/  enough to go on exactly
         training.safetensors      weights of model and inference network, Adam's moments
         state.json                step, best score; written last
@@ -33,13 +34,15 @@ from torch import Tensor, nn
 
 from envs.errors import UsageError
 from worldmodel.config import ModelConfig, ModelContext
-from worldmodel.devices import find_device
+from worldmodel.devices import best_precision, find_device
+from worldmodel.inference import InferenceNetwork, inference_network
 from worldmodel.models import make_model
 from worldmodel.world_model import WorldModel
 
 Precision = Literal["auto", "float32", "bfloat16"]
 PRETRAINED = Path(__file__).parent / "pretrained"
 WEIGHTS, CONFIG, TRAINING, STATE = "model.safetensors", "config.json", "training.safetensors", "state.json"
+INFERENCE = "inference.safetensors"
 KEEP = 2
 
 
@@ -66,11 +69,14 @@ def write_folder(folder: Path, tensors: Mapping[str, Mapping[str, Tensor]], docu
         aside.rename(folder)
 
 
-def save_model(model: WorldModel, folder: Path, origin: Mapping[str, Any]) -> None:
+def save_model(
+    model: WorldModel, folder: Path, origin: Mapping[str, Any], inference: InferenceNetwork | None = None
+) -> None:
     """Save weights and config for `load_model`.
 
     Args:
         origin: where the model came from (options, seed, data hashes, scores), kept in the config for people.
+        inference: of a model with latents, for `load_inference`; prediction does without it.
     """
     document = {
         "format": 1,
@@ -79,7 +85,8 @@ def save_model(model: WorldModel, folder: Path, origin: Mapping[str, Any]) -> No
         "context": asdict(model.context),
         "origin": dict(origin),
     }
-    write_folder(folder, {WEIGHTS: model.state_dict()}, {CONFIG: document})
+    tensors = {WEIGHTS: model.state_dict()} | ({INFERENCE: inference.state_dict()} if inference is not None else {})
+    write_folder(folder, tensors, {CONFIG: document})
 
 
 def find_model(name: str | Path) -> Path:
@@ -124,17 +131,33 @@ def load_model(name: str | Path, device: str | torch.device = "cpu", precision: 
         raise UsageError(
             f"the model in {folder} cannot be read ({reason}); train it again or restore the folder"
         ) from error
-    model.precision = _best_precision(device) if precision == "auto" else getattr(torch, precision)
+    model.precision = best_precision(device) if precision == "auto" else getattr(torch, precision)
     return model.to(device).to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
 
-def _best_precision(device: torch.device) -> torch.dtype:
-    """bfloat16 where the device has instructions for it; where it would be emulated, it is slower than float32."""
-    if device.type == "cuda":
-        native = torch.cuda.is_bf16_supported(including_emulation=False)
-    else:
-        native = getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)()
-    return torch.bfloat16 if native else torch.float32
+def load_inference(name: str | Path, model: WorldModel) -> InferenceNetwork | None:
+    """The inference network that was saved beside a model, on the model's device, in evaluation mode.
+
+    Args:
+        name: as for `load_model`.
+        model: what `load_model` made of it.
+
+    Returns:
+        None where the folder has none: the model is deterministic, or was shipped without.
+
+    Raises:
+        UsageError: the file is damaged or of another model.
+    """
+    path = find_model(name) / INFERENCE
+    if not model.latent_channels or not path.is_file():
+        return None
+    network = inference_network(model)
+    try:
+        network.load_state_dict(load_file(path))
+    except (SafetensorError, OSError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise UsageError(f"{path} cannot be read ({reason}); remove it, or restore the folder") from error
+    return network.to(model.device).eval()
 
 
 def save_training(

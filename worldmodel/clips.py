@@ -40,6 +40,8 @@ class ClipTruth:
     """(B, T-1, 3, H, W) metres, camera frame."""
     hand: Tensor
     """(B, T-1, H, W) bool, pixels of the end-effector in frame t."""
+    bodies: Tensor
+    """(B, T-1, H, W) int64, the body under each pixel of frame t; 0 is the world."""
     tcp: Tensor
     """(B, T, 3) metres, camera frame."""
 
@@ -124,6 +126,7 @@ class ClipSource:
         return ClipTruth(
             torch.from_numpy(flow).permute(0, 1, 4, 2, 3).float(),
             torch.from_numpy(hand),
+            torch.from_numpy(bodies[:, :-1].astype(np.int64)),
             torch.from_numpy(tcp).float(),
         )
 

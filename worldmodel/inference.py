@@ -1,4 +1,4 @@
-"""The inference network q(z | x_0:T), used in training only (paper, section III-C)."""
+"""The inference network q(z | x_0:T), used in training and to be measured, never to predict (paper, III-C)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from torch.nn import functional as F
 
 from worldmodel.blocks import layer_norm
 from worldmodel.trunk import scaled
+from worldmodel.world_model import WorldModel
 
 MIN_LOG_VARIANCE = -10.0
 
@@ -52,3 +53,10 @@ class InferenceNetwork(nn.Module):
         x = self.norm2(F.relu(self.conv2(around.flatten(0, 1))))
         mean, log_variance = self.heads(x).float().unflatten(0, (batch, length - 1)).chunk(2, dim=2)
         return mean, log_variance.clamp(min=MIN_LOG_VARIANCE)
+
+
+def inference_network(model: WorldModel) -> InferenceNetwork:
+    """A fresh inference network for a model with latents, on the CPU."""
+    return InferenceNetwork(
+        model.frame_channels, model.latent_channels, model.config.width, per_clip=model.config.latents == "clip"
+    )

@@ -22,7 +22,7 @@ from envs.errors import UsageError
 from worldmodel import losses
 from worldmodel.checkpoint import load_training, save_model, save_training
 from worldmodel.clips import Clips, ClipSource
-from worldmodel.inference import InferenceNetwork
+from worldmodel.inference import InferenceNetwork, inference_network
 from worldmodel.options import TrainOptions
 from worldmodel.pictures import picture_prediction
 from worldmodel.rollout import Rollout, unroll
@@ -60,10 +60,7 @@ class Trainer:
         self.modules: dict[str, torch.nn.Module] = {"model": model}
         self.inference: InferenceNetwork | None = None
         if model.latent_channels:
-            per_clip = model.config.latents == "clip"
-            self.inference = InferenceNetwork(
-                model.frame_channels, model.latent_channels, model.config.width, per_clip
-            ).to(self.device)
+            self.inference = inference_network(model).to(self.device)
             self.modules["inference"] = self.inference
         parameters = [p for module in self.modules.values() for p in module.parameters()]
         self.parameters = parameters
@@ -201,7 +198,7 @@ class Trainer:
         if score >= self.best:
             self.best = score
             origin = self.origin | {"step": self.step, "seconds": round(self.seconds), "validation": scores}
-            save_model(self.model, self.options.out / "model", origin)
+            save_model(self.model, self.options.out / "model", origin, self.inference)
 
     def save(self) -> None:
         """Write a checkpoint to go on from."""

@@ -84,7 +84,7 @@ def validate(model: WorldModel, data: ValidationSet, still: bool = False) -> Sco
             taught = unroll(model, clips, c, truth=1.0, still=still)
             flow = taught.stack("scene_flow")[:, c - 1 :].cpu()
             flows.append((flow, truth.scene_flow[:, c - 1 :], truth.hand[:, c - 1 :]))
-            tracked.append(_track(model, clips, truth, free, c))
+            tracked.append(track_tcp(model, clips, truth, free, c))
     model.train(was_training)
     all_rgb = torch.cat(rgb)
     psnr = psnr_per_step(torch.cat(predicted_rgb), all_rgb[:, 1:])
@@ -113,7 +113,7 @@ def validate(model: WorldModel, data: ValidationSet, still: bool = False) -> Sco
     return scores
 
 
-def _track(model: T3VIP, clips: Clips, truth: ClipTruth, free: Rollout, context: int) -> tuple[Tensor, Tensor]:
+def track_tcp(model: T3VIP, clips: Clips, truth: ClipTruth, free: Rollout, context: int) -> tuple[Tensor, Tensor]:
     """How far the TCP, moved by predicted transforms, is off at the clip's end, and how far it went, (B,) metres."""
     points = clips.depth[:, context - 1] * model.rays
     ends = []

@@ -8,7 +8,19 @@ import torch
 
 from envs.errors import UsageError
 from worldmodel import checkpoint
-from worldmodel.checkpoint import CONFIG, STATE, TRAINING, WEIGHTS, load_model, load_training, save_model, save_training
+from worldmodel.checkpoint import (
+    CONFIG,
+    INFERENCE,
+    STATE,
+    TRAINING,
+    WEIGHTS,
+    load_inference,
+    load_model,
+    load_training,
+    save_model,
+    save_training,
+)
+from worldmodel.inference import inference_network
 
 
 @pytest.fixture
@@ -43,6 +55,19 @@ def test_a_newer_model_replaces_the_older_one(saved, make_model):
     save_model(newer, folder, {})
     assert same(newer, load_model(folder))
     assert [path.name for path in folder.parent.iterdir()] == ["model"]
+
+
+def test_the_inference_network_may_stand_beside_the_model(saved):
+    model, folder = saved
+    assert load_inference(folder, load_model(folder)) is None
+    network = inference_network(model)
+    save_model(model, folder, {}, network)
+    loaded = load_inference(folder, load_model(folder))
+    assert same(model, load_model(folder)) and same(network, loaded) and not loaded.training
+    (folder / INFERENCE).write_bytes(b"no tensors")
+    assert same(model, load_model(folder))
+    with pytest.raises(UsageError, match=f"{INFERENCE} cannot be read"):
+        load_inference(folder, model)
 
 
 def test_killed_between_the_renames_the_older_model_is_still_found(saved):
