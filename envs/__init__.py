@@ -15,3 +15,9 @@ for _scene in "ABCD":
         max_episode_steps=TABLETOP_STEPS,
         kwargs={"scene": _scene},
     )
+
+PLANAR_PUSH_STEPS = 60  # 5 s at 12 Hz
+
+gymnasium.register(
+    id="t3vip/PlanarPush-v0", entry_point="envs.planar_push:PlanarPushEnv", max_episode_steps=PLANAR_PUSH_STEPS
+)

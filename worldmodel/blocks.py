@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
+
+from worldmodel.compilation import compiled
 
 LSTMState = tuple[Tensor, Tensor]
 """Hidden state in the precision that the network runs in and cell state in float32, each (B, C, H, W)."""
@@ -14,25 +18,69 @@ def layer_norm(channels: int) -> nn.Module:
     return nn.GroupNorm(1, channels)
 
 
+def _activate(gates: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Gates (B, 4C, H, W) to enter, candidate, forget, leave; float32.
+
+    With channels last, a slice of the channels is strided in memory, and sigmoid and tanh crawl on it: eagerly they run
+    on whole tensors, which the compiler is free to undo.
+    """
+    gates = gates.float()
+    enter, _, forget, leave = torch.sigmoid(gates).chunk(4, dim=1)
+    candidate = gates.chunk(4, dim=1)[1].contiguous(memory_format=torch.channels_last)
+    return enter, torch.tanh(candidate), forget, leave
+
+
+def _gates_forward(gates: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
+    enter, candidate, forget, leave = _activate(gates)
+    cell = forget * cell + enter * candidate
+    return (leave * torch.tanh(cell)).to(gates.dtype), cell
+
+
+@compiled
+def _gates_backward(gates: Tensor, cell: Tensor, of_hidden: Tensor, of_cell: Tensor) -> tuple[Tensor, Tensor]:
+    enter, candidate, forget, leave = _activate(gates)
+    shown = torch.tanh(forget * cell + enter * candidate)
+    of_hidden = of_hidden.float()
+    through = of_cell + of_hidden * leave * (1 - shown * shown)
+    of_gates = (
+        through * candidate * enter * (1 - enter),
+        through * enter * (1 - candidate * candidate),
+        through * cell * forget * (1 - forget),
+        of_hidden * shown * leave * (1 - leave),
+    )
+    return torch.cat(of_gates, dim=1).to(gates.dtype), through * forget
+
+
+_compiled_forward = compiled(_gates_forward)
+
+
+class _Gates(torch.autograd.Function):
+    """Keeps gates and cell only and activates them again on the way back: less memory to write and read."""
+
+    @staticmethod
+    def forward(ctx: Any, gates: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
+        ctx.save_for_backward(gates, cell)
+        return _compiled_forward(gates, cell)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
+        of_hidden, of_cell = (g.contiguous(memory_format=torch.channels_last) for g in gradients)
+        return _gates_backward(*ctx.saved_tensors, of_hidden, of_cell)
+
+
 def lstm_gates(gates: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
     """The pointwise half of an LSTM.
-
-    With channels last, a slice of the channels is strided in memory, and sigmoid and tanh crawl on it: they run on
-    whole tensors here.
 
     Args:
         gates: (B, 4C, H, W): input, candidate, forget, output.
         cell: (B, C, H, W) float32.
 
     Returns:
-        New hidden and cell state, float32.
+        The new hidden state, of the gates' precision, and the new cell state, float32.
     """
-    gates = gates.float()
-    channels = cell.shape[1]
-    enter, _, forget, leave = torch.sigmoid(gates).chunk(4, dim=1)
-    candidate = gates[:, channels : 2 * channels].contiguous(memory_format=torch.channels_last)
-    cell = forget * cell + enter * torch.tanh(candidate)
-    return leave * torch.tanh(cell), cell
+    if torch.is_grad_enabled() and (gates.requires_grad or cell.requires_grad):
+        return _Gates.apply(gates, cell)
+    return _gates_forward(gates, cell)
 
 
 class ConvLSTM(nn.Module):
@@ -47,6 +95,5 @@ class ConvLSTM(nn.Module):
 
     def forward(self, x: Tensor, state: LSTMState) -> tuple[Tensor, LSTMState]:
         """One step: `(B, inputs, H, W)` to `(B, channels, H, W)` and the new state."""
-        hidden, cell = lstm_gates(self.gates(torch.cat((x, state[0]), dim=1)), state[1])
-        hidden = hidden.to(state[0].dtype)
-        return hidden, (hidden, cell)
+        state = lstm_gates(self.gates(torch.cat((x, state[0]), dim=1)), state[1])
+        return state[0], state
