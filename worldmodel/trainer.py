@@ -96,7 +96,7 @@ class Trainer:
                     share = waited / max(time.monotonic() - started, 1e-9)
                     self._log(writer, "train", terms | {"seconds": self.seconds, "data_wait": share})
                 if self.step % options.validate_every == 0 or last:
-                    self.score(writer, bar)
+                    bar.write(self.score(writer))
                 if self.step % options.save_every == 0 or last or stopping():
                     self.save()
                 if stopping():
@@ -183,11 +183,10 @@ class Trainer:
         pixels = self.model.camera.height * self.model.camera.width
         return mean + (0.5 * log_variance).exp() * draws, losses.kl_to_prior(mean, log_variance, pixels)
 
-    def score(self, writer: SummaryWriter, bar: tqdm[Any]) -> None:
-        """Validate, draw a picture, and keep the model if it is the best so far."""
+    def score(self, writer: SummaryWriter) -> str:
+        """Validate, draw a picture, and keep the model if it is the best so far; returns a line for people."""
         scores = validate(self.model, self.validation)
         self._log(writer, "validation", scores)
-        bar.write(f"step {self.step}: {summary(scores)}")
         clips, starts = next(self.validation.batches())
         truth = None
         if self.validation.source.dataset.has_ground_truth:
@@ -199,6 +198,7 @@ class Trainer:
             self.best = score
             origin = self.origin | {"step": self.step, "seconds": round(self.seconds), "validation": scores}
             save_model(self.model, self.options.out / "model", origin, self.inference)
+        return f"step {self.step}: {summary(scores)}"
 
     def save(self) -> None:
         """Write a checkpoint to go on from."""

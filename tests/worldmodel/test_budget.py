@@ -54,7 +54,7 @@ class Rehearsal:
         self.clock[0] += seconds + (0 if seconds in self.compiled else 100)
         self.compiled.add(seconds)
 
-    def score(self, writer, bar):
+    def score(self, writer):
         self.clock[0] += self.validation.clips + (0 if "score" in self.compiled else 100)
         self.compiled.add("score")
 
