@@ -64,8 +64,9 @@ class _Gates(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
+        gates, cell = ctx.saved_tensors
         of_hidden, of_cell = (g.contiguous(memory_format=torch.channels_last) for g in gradients)
-        return _gates_backward(*ctx.saved_tensors, of_hidden, of_cell)
+        return _gates_backward(gates, cell, of_hidden, of_cell)
 
 
 def lstm_gates(gates: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:

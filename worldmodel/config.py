@@ -19,6 +19,8 @@ class ModelConfig:
     """Multiplier on every channel count: 1.0 is the paper's network, 0.5 the CPU preset's."""
     lstm_kernel: int = 5
     """Kernel of the ConvLSTMs."""
+    fine_skip: bool = True
+    """Whether decoders see the frame at full resolution; the paper's do not."""
     masks: int = 10
     """K: T3VIP's masks, the first of them the background, which never moves; the rivals' kernels."""
     kernel_size: int = 9

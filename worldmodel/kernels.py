@@ -97,7 +97,7 @@ class KernelModel(WorldModel):
         super().__init__(config, context)
         self.kernel_count = config.masks
         self.sources = self.kernel_count + (3 if self.copies_first else 2)
-        self.decoder = Decoder(self.sources + 3, config.width, config.lstm_kernel)
+        self.decoder = Decoder(self.sources + 3, config)
         self.kernel_head = KernelHead(
             self.embedding_size, self.action_dim, self.kernel_count, config.kernel_size, config.width
         )

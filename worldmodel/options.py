@@ -125,7 +125,7 @@ PRESETS: dict[str, TrainOptions] = {
         "cpu",
         architecture=ModelConfig(width=0.5, lstm_kernel=3),
         schedule=replace(Schedule(), clip_lengths=((0.45, 4), (0.8, 8), (1.0, 12))),
-        steps=2000,
+        steps=1600,
         validate_every=400,
         save_every=100,
         precision="bfloat16",

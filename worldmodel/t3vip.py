@@ -102,8 +102,8 @@ class T3VIP(WorldModel):
     def __init__(self, config: ModelConfig, context: ModelContext) -> None:
         super().__init__(config, context)
         height, width = self.camera.height, self.camera.width
-        self.mask_decoder = Decoder(config.masks, config.width, config.lstm_kernel)
-        self.inpainter = Decoder(4, config.width, config.lstm_kernel)
+        self.mask_decoder = Decoder(config.masks, config)
+        self.inpainter = Decoder(4, config)
         self.transforms = TransformHead(self.embedding_size, self.action_dim, config.masks - 1, config.width)
         nn.init.normal_(self.mask_decoder.head.weight, std=config.mask_head_std)
 

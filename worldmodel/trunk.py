@@ -1,4 +1,9 @@
-"""CDNA's trunk, shared by all models: an encoder to the motion embedding and decoders back to pictures."""
+"""CDNA's trunk, shared by all models: an encoder to the motion embedding and decoders back to pictures.
+
+One thing is added to the paper's: its decoders see the frame at half of its resolution at best, so that no mask can
+follow a silhouette to the pixel, and nearly all false motion lies on the rim of what moves. Here a few features of the
+frame at full resolution join the last layer (`fine_skip`), of T3VIP and of its rivals.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +12,24 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from worldmodel.blocks import ConvLSTM, LSTMState, layer_norm
+from worldmodel.config import ModelConfig
 
 STRIDE = 8
 """The motion embedding is this much smaller than the picture."""
 
 
+Skips = list[Tensor]
+"""What a decoder sees of the frame besides the motion embedding, the finest first."""
+
+
 def scaled(channels: int, width: float) -> int:
     """A layer's channels under the width multiplier, a multiple of 8."""
     return max(8, round(channels * width / 8) * 8)
+
+
+def fine_channels(config: ModelConfig) -> int:
+    """Of the skip at full resolution."""
+    return scaled(16, config.width)
 
 
 class Encoder(nn.Module):
@@ -24,9 +39,11 @@ class Encoder(nn.Module):
     are tiled and joined by a 1x1 conv; ConvLSTM 128. A layer norm follows the first convolution and every LSTM.
     """
 
-    def __init__(self, inputs: int, action_dim: int, latent_channels: int, width: float, lstm_kernel: int) -> None:
+    def __init__(self, inputs: int, action_dim: int, latent_channels: int, config: ModelConfig) -> None:
         super().__init__()
-        small, middle, large = (scaled(c, width) for c in (32, 64, 128))
+        lstm_kernel = config.lstm_kernel
+        small, middle, large = (scaled(c, config.width) for c in (32, 64, 128))
+        self.fine = nn.Conv2d(inputs, fine_channels(config), 3, padding=1) if config.fine_skip else None
         self.channels = (small, middle, large)
         self.conv0 = nn.Conv2d(inputs, small, 5, stride=2, padding=2)
         self.norm0 = layer_norm(small)
@@ -42,7 +59,7 @@ class Encoder(nn.Module):
         self.norm3, self.norm4 = layer_norm(middle), layer_norm(middle)
         self.norm5 = layer_norm(large)
 
-    def look(self, frame: Tensor, states: list[LSTMState]) -> tuple[Tensor, tuple[Tensor, Tensor], list[LSTMState]]:
+    def look(self, frame: Tensor, states: list[LSTMState]) -> tuple[Tensor, Skips, list[LSTMState]]:
         """The part that knows no action yet, and so is the same for all futures of a frame.
 
         Args:
@@ -50,8 +67,9 @@ class Encoder(nn.Module):
             states: of the first four LSTMs.
 
         Returns:
-            Features (B, 128w, H/8, W/8), the skips at 1/2 and 1/4 of the size, the new states.
+            Features (B, 128w, H/8, W/8), the skips at the full size (if any), 1/2 and 1/4 of it, the new states.
         """
+        fine = [] if self.fine is None else [F.relu(self.fine(frame))]
         skip0 = self.norm0(F.relu(self.conv0(frame)))
         x, state1 = self.lstm1(skip0, states[0])
         x, state2 = self.lstm2(self.norm1(x), states[1])
@@ -59,7 +77,7 @@ class Encoder(nn.Module):
         x, state3 = self.lstm3(skip1, states[2])
         x, state4 = self.lstm4(self.norm3(x), states[3])
         x = F.relu(self.conv2(self.norm4(x)))
-        return x, (skip0, skip1), [state1, state2, state3, state4]
+        return x, [*fine, skip0, skip1], [state1, state2, state3, state4]
 
     def act(
         self, features: Tensor, action: Tensor, latent: Tensor | None, state: LSTMState
@@ -82,11 +100,15 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Motion embedding back to a picture: deconv, ConvLSTM 64, skip, deconv, ConvLSTM 32, skip, deconv, 1x1 conv."""
+    """Motion embedding back to a picture: deconv, ConvLSTM 64, skip, deconv, ConvLSTM 32, skip, deconv, 1x1 conv.
 
-    def __init__(self, outputs: int, width: float, lstm_kernel: int) -> None:
+    With `fine_skip` a skip and a conv 3x3 come before the last.
+    """
+
+    def __init__(self, outputs: int, config: ModelConfig) -> None:
         super().__init__()
-        small, middle, large = (scaled(c, width) for c in (32, 64, 128))
+        lstm_kernel = config.lstm_kernel
+        small, middle, large = (scaled(c, config.width) for c in (32, 64, 128))
         self.up1 = nn.ConvTranspose2d(large, middle, 4, stride=2, padding=1)
         self.lstm6 = ConvLSTM(middle, middle, lstm_kernel)
         self.norm6 = layer_norm(middle)
@@ -94,17 +116,18 @@ class Decoder(nn.Module):
         self.lstm7 = ConvLSTM(small, small, lstm_kernel)
         self.norm7 = layer_norm(small)
         self.up3 = nn.ConvTranspose2d(2 * small, small, 4, stride=2, padding=1)
+        self.refine = nn.Conv2d(small + fine_channels(config), small, 3, padding=1) if config.fine_skip else None
         self.norm8 = layer_norm(small)
         self.head = nn.Conv2d(small, outputs, 1)
 
-    def forward(
-        self, embedding: Tensor, skips: tuple[Tensor, Tensor], states: list[LSTMState]
-    ) -> tuple[Tensor, list[LSTMState]]:
+    def forward(self, embedding: Tensor, skips: Skips, states: list[LSTMState]) -> tuple[Tensor, list[LSTMState]]:
         """Decode to `(B, outputs, H, W)`, no activation; `states` are those of the two LSTMs."""
-        skip0, skip1 = skips
+        *fine, skip0, skip1 = skips
         x, state6 = self.lstm6(F.relu(self.up1(embedding)), states[0])
         x = torch.cat((self.norm6(x), skip1), dim=1)
         x, state7 = self.lstm7(F.relu(self.up2(x)), states[1])
         x = torch.cat((self.norm7(x), skip0), dim=1)
-        x = self.norm8(F.relu(self.up3(x)))
-        return self.head(x), [state6, state7]
+        x = F.relu(self.up3(x))
+        if self.refine is not None:
+            x = F.relu(self.refine(torch.cat((x, *fine), dim=1)))
+        return self.head(self.norm8(x)), [state6, state7]

@@ -13,7 +13,7 @@ from envs.camera import CameraModel
 from envs.errors import UsageError
 from worldmodel.blocks import LSTMState
 from worldmodel.config import ModelConfig, ModelContext
-from worldmodel.trunk import STRIDE, Encoder
+from worldmodel.trunk import STRIDE, Encoder, Skips
 
 
 def expand(x: Tensor, count: int) -> Tensor:
@@ -93,9 +93,7 @@ class WorldModel(nn.Module, ABC):
             )
         self.action_dim = context.action_dim if config.act_cond else 0
         self.latent_channels = 0 if config.latents == "none" else 1
-        self.encoder = Encoder(
-            self.frame_channels, self.action_dim, self.latent_channels, config.width, config.lstm_kernel
-        )
+        self.encoder = Encoder(self.frame_channels, self.action_dim, self.latent_channels, config)
         self.embedding_size = self.encoder.channels[-1] * (height // STRIDE) * (width // STRIDE)
         self.register_buffer("action_mean", torch.tensor(context.action_mean), persistent=False)
         self.register_buffer("action_std", torch.tensor(context.action_std), persistent=False)
@@ -205,7 +203,7 @@ class WorldModel(nn.Module, ABC):
 
     def embed(
         self, frame: Tensor, action: Tensor, latent: Tensor | None, states: list[LSTMState]
-    ) -> tuple[Tensor, tuple[Tensor, Tensor], list[LSTMState], list[LSTMState]]:
+    ) -> tuple[Tensor, Skips, list[LSTMState], list[LSTMState]]:
         """The trunk: to the motion embedding, the skips, the encoder's new states and the decoders' old ones.
 
         One past may have many futures: what was seen is then encoded once.
@@ -213,7 +211,7 @@ class WorldModel(nn.Module, ABC):
         features, skips, seen = self.encoder.look(frame, states[:4])
         if len(action) > len(frame):
             count = len(action)
-            features, skips = expand(features, count), (expand(skips[0], count), expand(skips[1], count))
+            features, skips = expand(features, count), [expand(skip, count) for skip in skips]
             seen, states = Memory(seen).expand(count).states, Memory(states).expand(count).states
         embedding, acted = self.encoder.act(features, action, latent, states[4])
         return embedding, skips, [*seen, acted], states[5:]

@@ -5,6 +5,7 @@ import torch
 from torch.nn import functional as F
 
 from worldmodel.blocks import ConvLSTM, layer_norm, lstm_gates
+from worldmodel.config import ModelConfig
 from worldmodel.trunk import Decoder, Encoder, scaled
 
 HEIGHT, WIDTH = 16, 24
@@ -63,7 +64,7 @@ def blank_states(encoder, batch):
 @pytest.mark.parametrize(("action_dim", "latent_channels"), [(7, 1), (0, 1), (7, 0)])
 def test_encoder_shapes_memory_and_inputs(action_dim, latent_channels):
     torch.manual_seed(0)
-    encoder = Encoder(4, action_dim, latent_channels, width=0.25, lstm_kernel=3)
+    encoder = Encoder(4, action_dim, latent_channels, ModelConfig(width=0.25, lstm_kernel=3))
     frame = torch.rand(2, 4, HEIGHT, WIDTH)
     action = torch.randn(2, action_dim, requires_grad=True)
     latent = torch.randn(2, 1, HEIGHT // 8, WIDTH // 8, requires_grad=True) if latent_channels else None
@@ -74,9 +75,10 @@ def test_encoder_shapes_memory_and_inputs(action_dim, latent_channels):
         embedding, acted = encoder.act(features, action, latent, states[4])
         return embedding, skips, [*seen, acted]
 
-    embedding, (skip0, skip1), after = encode(states)
+    embedding, (fine, skip0, skip1), after = encode(states)
     small, middle, large = encoder.channels
     assert embedding.shape == (2, large, HEIGHT // 8, WIDTH // 8)
+    assert fine.shape == (2, 8, HEIGHT, WIDTH)
     assert skip0.shape == (2, small, HEIGHT // 2, WIDTH // 2) and skip1.shape == (2, middle, HEIGHT // 4, WIDTH // 4)
     assert [hidden.shape for hidden, _ in after] == [hidden.shape for hidden, _ in states]
     weights = torch.randn_like(embedding)
@@ -91,8 +93,9 @@ def test_encoder_shapes_memory_and_inputs(action_dim, latent_channels):
 
 def test_decoder_comes_back_to_the_size_of_the_picture():
     torch.manual_seed(0)
-    decoder = Decoder(5, width=0.25, lstm_kernel=3)
-    skips = (torch.randn(2, 8, HEIGHT // 2, WIDTH // 2), torch.randn(2, 16, HEIGHT // 4, WIDTH // 4))
+    decoder = Decoder(5, ModelConfig(width=0.25, lstm_kernel=3))
+    sizes = ((8, 1), (8, 2), (16, 4))
+    skips = [torch.randn(2, channels, HEIGHT // stride, WIDTH // stride) for channels, stride in sizes]
     embedding = torch.randn(2, 32, HEIGHT // 8, WIDTH // 8)
     states = [
         (torch.zeros(2, 16, HEIGHT // 4, WIDTH // 4),) * 2,
@@ -100,8 +103,10 @@ def test_decoder_comes_back_to_the_size_of_the_picture():
     ]
     out, after = decoder(embedding, skips, states)
     assert out.shape == (2, 5, HEIGHT, WIDTH)
-    for i in range(2):
-        changed_skips, changed_states = list(skips), list(states)
-        changed_skips[i], changed_states[i] = skips[i] + 1, after[i]
-        assert not torch.allclose(decoder(embedding, tuple(changed_skips), states)[0], out, atol=1e-5)
+    for i in range(3):  # every skip is read
+        changed_skips = [skip + (number == i) for number, skip in enumerate(skips)]
+        assert not torch.allclose(decoder(embedding, changed_skips, states)[0], out, atol=1e-5)
+    for i in range(2):  # every LSTM's memory is read
+        changed_states = list(states)
+        changed_states[i] = after[i]
         assert not torch.allclose(decoder(embedding, skips, changed_states)[0], out, atol=1e-5)
