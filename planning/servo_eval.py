@@ -37,9 +37,10 @@ class ServoConfig:
     """
 
     out: Path = Path("runs/servo")
-    """folder for servo.json, episodes.jsonl, the bar chart and the videos"""
+    """folder for servo.json, episodes.jsonl, the charts and the videos"""
     model: tuple[str, ...] = ("t3vip",)
-    """controllers to compare"""
+    """controllers to compare: t3vip plans in 3D; sv2p, sna and cdna are given the goal's pixel only; oracle plans in
+    the simulator; linear, proportional and random have no world model"""
     checkpoint: tuple[str, ...] = ()
     """weights to use instead of the shipped ones: a checkpoint folder, or MODEL=FOLDER for each of several models"""
     episodes: int = 50
@@ -57,12 +58,12 @@ class ServoConfig:
     image_size: int = 64
     """pixels; what the world model was trained on"""
     hold: int = 3
-    """control steps that a planned translation is held for; a world model holds for its frame gap"""
+    """control steps that a planned translation is held for where no world model's frame gap says so"""
     planner: Annotated[ICEMConfig, tyro.conf.arg(name="planner")] = field(default_factory=ICEMConfig)
     deadline: float | None = None
     """seconds after which a plan must be there"""
     video: int = 0
-    """episodes per model to film"""
+    """episodes per model to film; with t3vip and a pixel model among them also a film strip of both"""
     device: str = "cpu"
     """where world models run, e.g. cpu or cuda"""
 
@@ -121,7 +122,7 @@ def main(config: ServoConfig) -> None:
     kit = Kit(env, config.planner, config.hold, config.checkpoints(), config.device, config.deadline)
     try:
         learned = {name: kit.model(name) for name in config.model if name in LEARNED}
-        kit.hold = next((model.frame_gap for model in learned.values()), config.hold)
+        kit.hold = common_gap(learned) or config.hold
         config.out.mkdir(parents=True, exist_ok=True)
         with locked(config.out):
             log = EpisodeLog(config.out, settings(config, kit.hold, learned))
@@ -132,6 +133,19 @@ def main(config: ServoConfig) -> None:
         kit.close()
         studio.close()
         env.close()
+
+
+def common_gap(learned: dict[str, Any]) -> int | None:
+    """The frame gap of the world models, None without any.
+
+    Raises:
+        UsageError: they differ. Then one would decide more often than another, and look less far ahead.
+    """
+    gaps = {name: model.frame_gap for name, model in learned.items()}
+    if len(set(gaps.values())) > 1:
+        listed = ", ".join(f"{name} {gap}" for name, gap in gaps.items())
+        raise UsageError(f"the models' frame gaps differ ({listed}); give checkpoints of one frame gap")
+    return next(iter(gaps.values()), None)
 
 
 def settings(config: ServoConfig, hold: int, learned: dict[str, Any]) -> dict[str, Any]:

@@ -75,6 +75,8 @@ class Kit:
 
 def _check_fits(name: str, model: Any, env: gym.Env) -> None:
     """A model can plan for an environment that sees and acts like the one it was trained in."""
+    if model.kind != name:
+        raise UsageError(f"the checkpoint given for {name} is a {model.kind}; give the weights of a {name}")
     trained, env_id = model.context.env_id, env.spec.id if env.spec else type(env.unwrapped).__name__
     family = "t3vip/Tabletop"
     if family not in trained:

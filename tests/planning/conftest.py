@@ -12,6 +12,7 @@ import torch
 
 from envs.camera import CameraModel
 from planning.controllers import Goal
+from worldmodel.kernels import KernelPrediction
 
 AGGREGATION = ("sum", "sum", "sum", "rotate", "rotate", "rotate", "last")
 SCALE = (0.02, 0.02, 0.02, 0.05, 0.05, 0.05, 1.0)
@@ -30,6 +31,7 @@ class ExactModel:
     channels: tuple[int, ...] = tuple(range(7))
     shown: list[tuple[torch.Tensor, ...]] = field(default_factory=list)
     asked: list[torch.Tensor] = field(default_factory=list)
+    kind: str = "t3vip"
 
     def __post_init__(self) -> None:
         self.context = SimpleNamespace(
@@ -59,12 +61,37 @@ class ExactModel:
         self.asked.append(action)
         count = len(action)
         assert action.shape == (count, self.action_dim) and state in (None, count)
+        return count, self.predict(self.shift(action))
+
+    def shift(self, action):
+        """Metres in the camera's frame, (N, 3)."""
         rotation = torch.tensor(self.camera.world_T_camera[:3, :3].tolist())
-        shift = 0.02 * action[:, self.channels][:, :3] @ rotation
+        return 0.02 * action[:, self.channels][:, :3] @ rotation
+
+    def predict(self, shift):
+        count = len(shift)
         transform = torch.cat([torch.eye(3).expand(count, 3, 3), shift[:, :, None]], dim=2)
         field_ = transform[..., None, None].expand(count, 3, 4, self.camera.height, self.camera.width)
         masks = torch.zeros(count, 2, self.camera.height, self.camera.width)  # all that is seen moves
-        return count, SimpleNamespace(transform=field_, masks=masks)
+        return SimpleNamespace(transform=field_, masks=masks)
+
+
+class ExactPixelModel(ExactModel):
+    """Shifts the picture as the action says, which it knows of an arm that is 4.2 m away; one kernel does it all."""
+
+    reach = 10
+
+    def __init__(self, camera: CameraModel, kind: str = "sv2p", **options: Any) -> None:
+        super().__init__(camera, kind=kind, **options)
+
+    def predict(self, shift):
+        pixels = shift[:, :2] * float(self.camera.K[0, 0]) / 4.2  # (N, 2)
+        places = torch.arange(-self.reach, self.reach + 1.0)
+        # The entry right of the centre brings a pixel from the right: to move by +d the weight is at -d, linearly.
+        u, v = ((1 - (places + pixels[:, axis, None]).abs()).clamp(min=0) for axis in (0, 1))
+        masks = torch.zeros(len(shift), 3, self.camera.height, self.camera.width)
+        masks[:, 1] = 1
+        return KernelPrediction(None, masks, None, (v[:, :, None] * u[:, None])[:, None])
 
 
 class ArrayWorld:
@@ -119,3 +146,13 @@ def exact_model(camera) -> ExactModel:
 @pytest.fixture
 def make_exact_model():
     return ExactModel
+
+
+@pytest.fixture
+def pixel_model(camera) -> ExactPixelModel:
+    return ExactPixelModel(camera)
+
+
+@pytest.fixture
+def make_pixel_model():
+    return ExactPixelModel

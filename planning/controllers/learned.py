@@ -1,0 +1,87 @@
+"""What controllers with a world model share: what the model is shown, and how planned moves become its actions."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from data_collection.actions import aggregate_actions
+from envs.camera import CameraModel
+from planning.controllers.base import Goal, Observation, PlanningController, tcp_position
+from planning.costs import env_action
+from planning.icem import ICEM
+from worldmodel.tracking import HAND_RADIUS
+
+
+class LearnedController(PlanningController):
+    """Plans with a world model, which is shown frames and actions, nothing else.
+
+    Of the world a controller of this kind is given RGB-D frames, proprioception (for where the TCP is now, and the
+    gripper's command), the camera's geometry and the goal. A subclass says in `imagine` what it makes of the model's
+    predictions.
+
+    Args:
+        model: a world model (`worldmodel.load_model`) with `observe`, `step` and `frame_gap`.
+        camera: geometry of the camera that takes the frames.
+        planner: searches sequences of translations, each held for `frame_gap` control steps.
+        context_frames: frames that the model is shown before every plan.
+        radius: metres around the TCP that are taken for the hand.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        camera: CameraModel,
+        planner: ICEM,
+        context_frames: int = 2,
+        radius: float = HAND_RADIUS,
+    ) -> None:
+        super().__init__(planner, model.frame_gap, model.action_dim)
+        self.model, self.camera, self.radius = model, camera, radius
+        self.context_frames = context_frames
+        parameter = next(iter(model.parameters()), None)
+        self.device = torch.device("cpu") if parameter is None else parameter.device
+
+    def reset(self, observation: Observation, goal: Goal) -> None:
+        super().reset(observation, goal)
+        self.frames: deque[Observation] = deque(maxlen=self.context_frames)
+        self.executed: deque[NDArray] = deque(maxlen=self.context_frames - 1)
+
+    def decide(self, observation: Observation) -> NDArray:
+        if not self.frames:  # nothing came before: the first frame, standing still
+            self.frames.extend([observation] * (self.context_frames - 1))
+            self.executed.extend([self.aggregated(np.zeros(3))] * (self.context_frames - 1))
+        self.frames.append(observation)
+        move = super().decide(observation)
+        self.executed.append(self.aggregated(move))
+        return move
+
+    def aggregated(self, moves: NDArray) -> NDArray[np.float32]:
+        """The actions (..., action_dim) of the model for translations (..., 3), each held for a frame gap."""
+        actions = env_action(moves, self.gripper, self.action_dim)
+        held = np.repeat(actions[..., None, :], self.hold, axis=-2)
+        return aggregate_actions(held, self.model.context.action_aggregation, self.model.context.action_scale)
+
+    def observed(self) -> Any:
+        """The model's state after the frames so far."""
+        rgb = self.tensor(np.stack([frame["rgb"] for frame in self.frames])) / 255
+        depth = self.tensor(np.stack([frame["depth"] for frame in self.frames]))
+        actions = np.reshape(np.array(self.executed, np.float32), (-1, self.action_dim))
+        with torch.inference_mode():
+            return self.model.observe(rgb.permute(0, 3, 1, 2)[None], depth[None, :, None], self.tensor(actions)[None])
+
+    def seen_points(self, observation: Observation) -> torch.Tensor:
+        """What the camera sees, (3, H, W), metres, camera frame."""
+        return self.tensor(self.camera.unproject(observation["depth"])).permute(2, 0, 1)
+
+    def tcp_in_camera(self, observation: Observation) -> torch.Tensor:
+        """The measured TCP (3,), metres, camera frame."""
+        return self.tensor(self.camera.to_camera(tcp_position(observation)))
+
+    def tensor(self, array: NDArray) -> torch.Tensor:
+        """Float32, where the model is."""
+        return torch.as_tensor(np.asarray(array, np.float32), device=self.device)

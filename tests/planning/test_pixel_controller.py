@@ -1,0 +1,124 @@
+"""A controller of pictures reaches pixels, and cannot know what lies behind them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from planning.controllers import CONTROLLERS, LEARNED, PIXEL_MODELS
+from planning.controllers.pixel import PixelController
+from planning.icem import ICEM, ICEMConfig
+
+
+def planner(seed=0, **options):
+    return ICEM(ICEMConfig(**options), -np.ones(3), np.ones(3), np.random.default_rng(seed))
+
+
+def pixel_of(world):
+    return world.camera.project(world.camera.to_camera(world.tcp))
+
+
+def servo(controller, world, goal, steps=60):
+    """Runs the controller; returns its actions and, after each, the distance in the picture."""
+    observation = world.observation()
+    controller.reset(observation, goal)
+    actions, distances = [], []
+    for _ in range(steps):
+        actions.append(controller.act(observation))
+        observation = world.step(actions[-1])
+        distances.append(np.linalg.norm(pixel_of(world) - goal.pixel))
+    return np.array(actions), np.array(distances)
+
+
+def test_reaches_the_pixel_with_an_exact_model(pixel_model, camera, world, goal):
+    way = np.linalg.norm(pixel_of(world) - goal.pixel)
+    _, distances = servo(PixelController("sv2p", pixel_model, camera, planner()), world, goal)
+    assert way > 15 and (distances <= 0.1 * way).sum() >= 5 and distances[-10:].max() < 0.2 * way
+
+
+def test_needs_its_model(make_pixel_model, camera, world, goal):
+    """With the action's numbers mixed up before the model, the TCP misses the pixel."""
+    model = make_pixel_model(camera, channels=(1, 2, 0, 3, 4, 5, 6))
+    way = np.linalg.norm(pixel_of(world) - goal.pixel)
+    _, distances = servo(PixelController("sv2p", model, camera, planner()), world, goal)
+    assert (distances <= 0.1 * way).sum() < 5
+
+
+def test_does_not_know_how_far_away_the_goal_is(pixel_model, camera, world, goal):
+    """Bitwise: another goal on the same ray, and a goal that is nowhere, change no action."""
+    start = world.tcp.copy()
+    runs = []
+    for along in (0.0, 0.3, -0.2, np.nan):
+        world.tcp, world.steps = start.copy(), 0
+        point = goal.point_world + along * (goal.point_world - camera.world_T_camera[:3, 3])
+        moved = dataclasses.replace(goal, point_world=point)
+        runs.append(servo(PixelController("sv2p", pixel_model, camera, planner()), world, moved, steps=12)[0])
+    for other in runs[1:]:
+        np.testing.assert_array_equal(runs[0], other)
+
+
+def hand_beside(world, camera, du):
+    """Observations in which the hand shows to the side of the TCP only, by up to 5 pixels; the rest is far behind."""
+    seen = world.observation
+
+    def observation():
+        now = seen()
+        u, v = np.rint(pixel_of(world)).astype(int)
+        hand = np.zeros_like(now["depth"], bool)
+        hand[v - 2 : v + 3, min(u, u + du) : max(u, u + du) + 1] = True
+        now["depth"] = np.where(hand, now["depth"], now["depth"] + 0.5).astype(np.float32)
+        return now
+
+    return observation
+
+
+def test_it_is_the_tcp_that_goes_to_the_pixel_not_the_hand(pixel_model, camera, world, goal):
+    world.observation = hand_beside(world, camera, -5)
+    _, distances = servo(PixelController("sv2p", pixel_model, camera, planner()), world, goal)
+    assert np.median(distances[-15:]) < 1.2  # the hand's mean is 2.5 pixels beside
+
+
+def test_designated_are_the_pixels_of_the_hand_in_both_frames(pixel_model, camera, world, goal):
+    world.observation = hand_beside(world, camera, 5)
+    controller = PixelController("sv2p", pixel_model, camera, planner())
+    observation = world.observation()
+    controller.reset(observation, goal)
+    for _ in range(4):
+        observation = world.step(controller.act(observation))
+    before, now = (controller.designated(frame) for frame in (controller.frames[0], controller.frames[1]))
+    assert now.sum() == pytest.approx(1) and 15 <= (now > 0).sum() <= 30
+    assert not torch.equal(before, now)
+
+    # A model that copies the first frame only: whatever is done, the hand will be where it was then.
+    predict = pixel_model.predict
+
+    def first_only(shift):
+        prediction = predict(shift)
+        masks = torch.zeros(len(shift), 4, camera.height, camera.width)
+        masks[:, 3] = 1
+        return dataclasses.replace(prediction, masks=masks)
+
+    pixel_model.predict = first_only
+    costs = controller.imagine(controller.frames[1])(np.random.default_rng(0).uniform(-1, 1, (5, 2, 3)))
+    grid = np.stack(np.meshgrid(np.arange(64), np.arange(64)), axis=-1)
+    hand = np.array((now[..., None] * torch.from_numpy(grid)).sum((0, 1)))
+    tcp = camera.project(camera.to_camera(np.float32(controller.frames[1]["proprio"][:3])))
+    far = np.linalg.norm(grid - (goal.pixel - tcp + hand), axis=-1)
+    np.testing.assert_allclose(costs, (1 + 0.95) * (before.numpy() * far).sum(), rtol=1e-4)
+
+
+def test_a_hand_lost_from_the_picture_costs_infinitely(pixel_model, camera, world, goal):
+    """A future without a place must not look like a good one."""
+    controller = PixelController("sv2p", pixel_model, camera, planner())
+    observation = world.observation()
+    controller.reset(observation, goal)
+    controller.act(observation)
+    predict = pixel_model.predict
+    pixel_model.predict = lambda shift: dataclasses.replace(predict(shift), masks=torch.zeros(len(shift), 3, 64, 64))
+    costs = controller.imagine(observation)(np.zeros((3, 2, 3)))
+    assert not np.isfinite(costs).any()
+
+
+def test_all_pixel_models_have_a_controller():
+    assert set(PIXEL_MODELS) == {"sv2p", "sna", "cdna"} and set(LEARNED) <= set(CONTROLLERS)

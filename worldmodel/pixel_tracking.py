@@ -1,0 +1,102 @@
+"""Following designated pixels through predicted kernels: what a model of pictures can say about where a thing will be.
+
+A distribution over the pixels of the current frame goes the way of the colours (Finn and Levine 2017, "Deep visual
+foresight"): through the same kernels, blended by the same masks. What the mask takes from the current frame stays;
+what it takes from the first frame is where the designated pixels were then; what it takes from the generated picture
+came from nowhere, so that this mass is lost. The rest is scaled up to sum 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from worldmodel.geometry import pixel_grid
+from worldmodel.kernels import KernelPrediction, convolve
+
+Box = tuple[int, int, int, int]
+"""Rows top to bottom and columns left to right of a window, the ends not included."""
+
+
+def uniform_pixels(indices: Tensor, height: int, width: int) -> Tensor:
+    """The same mass on each of some pixels, which are indices (M,) into H*W row by row: (H, W) that sums to 1."""
+    distribution = torch.zeros(height * width, device=indices.device)
+    distribution[indices] = 1 / len(indices)
+    return distribution.view(height, width)
+
+
+@dataclass(frozen=True, eq=False)
+class PixelTrack:
+    """Where the designated pixels are in N imagined futures.
+
+    Attributes:
+        distribution: (N, H, W), sums to 1 in each future. N is 1 at the start, from which any number of futures begin.
+            A future in which all mass was lost is NaN from then on.
+        first: (1, H, W), the designated pixels of the first frame that the model was shown.
+        box: the window outside of which there is no mass, in no future.
+    """
+
+    distribution: Tensor
+    first: Tensor
+    box: Box
+
+    @classmethod
+    def start(cls, now: Tensor, first: Tensor | None = None) -> PixelTrack:
+        """Designate pixels.
+
+        Args:
+            now: (H, W) distribution over the current frame, sums to 1.
+            first: (H, W) over the first frame that the model was shown; `now` when there was no other.
+        """
+        first = now if first is None else first
+        rows, columns = (now + first).nonzero().unbind(1)
+        box = (int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1)
+        return cls(now[None], first[None], box)
+
+    def advance(self, prediction: KernelPrediction) -> PixelTrack:
+        """One predicted step on.
+
+        Mass can go no farther than a kernel reaches, so only a window that grows by that is computed. Mass that leaves
+        the picture is lost, and none comes in: edges are not repeated here, as they are for colours.
+
+        Args:
+            prediction: of N futures.
+        """
+        masks, kernels = prediction.masks, prediction.kernels
+        futures, count, size = kernels.shape[:3]
+        height, width = masks.shape[-2:]
+        reach = size // 2
+        top, bottom, left, right = self.box
+        inner = self.distribution[:, None, top:bottom, left:right]
+        wide = F.pad(inner, (reach, reach, reach, reach))  # (N, 1, h, w), rows from `top - reach` on
+        moved = convolve(wide.expand(futures, -1, -1, -1), kernels)[:, :, 0]  # (N, K, h, w)
+        box = max(top - reach, 0), min(bottom + reach, height), max(left - reach, 0), min(right + reach, width)
+        seen = (slice(box[0], box[1]), slice(box[2], box[3]))
+        kept = (
+            slice(box[0] - top + reach, box[1] - top + reach),
+            slice(box[2] - left + reach, box[3] - left + reach),
+        )
+        masks = masks[..., seen[0], seen[1]]
+        mass = masks[:, 0] * wide[:, 0, kept[0], kept[1]]
+        mass = mass + (masks[:, 1 : 1 + count] * moved[..., kept[0], kept[1]]).sum(dim=1)
+        if masks.shape[1] > count + 2:  # current frame, kernels, generated picture, first frame
+            mass = mass + masks[:, count + 2] * self.first[:, seen[0], seen[1]]
+        distribution = mass.new_zeros((futures, height, width))
+        distribution[:, seen[0], seen[1]] = mass / mass.sum(dim=(1, 2), keepdim=True)
+        return PixelTrack(distribution, self.first, box)
+
+    def expected_position(self) -> Tensor:
+        """(N, 2), the mean pixel (u, v)."""
+        return torch.einsum("nhw,chw->nc", self.distribution, self._grid())
+
+    def expected_distance(self, goal: Tensor) -> Tensor:
+        """(N,), the mean distance in pixels to `goal`, a pixel (u, v)."""
+        distance = (self._grid() - goal[:, None, None]).norm(dim=0)
+        return torch.einsum("nhw,hw->n", self.distribution, distance)
+
+    def _grid(self) -> Tensor:
+        grid = pixel_grid(*self.distribution.shape[-2:])
+        return grid.to(self.distribution)
