@@ -1,0 +1,84 @@
+"""Where an episode starts: which object, how it is inside, where it lies, and where the tip is."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.errors import UsageError
+from envs.planar_push import objects, pieces
+from envs.planar_push.control import WORKSPACE_HIGH, WORKSPACE_LOW
+from envs.planar_push.hidden import Hidden
+from envs.planar_push.scene import TIP_RADIUS
+
+OBJECT_AREA = 0.07  # m, half the side of the square that the object's middle starts in
+TIP_DISTANCE = (0.10, 0.16)  # m, from the middle of the object
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """The start of an episode."""
+
+    object_name: str
+    hidden: Hidden
+    pose: NDArray[np.float64]
+    """x, y, yaw of the object (3,), m and rad."""
+    tip: NDArray[np.float64]
+    """(2,) m"""
+    noise_seed: int
+
+    def with_options(self, options: Mapping[str, Any]) -> Start:
+        """With what the options of `PlanarPushEnv.reset` say instead of what was drawn.
+
+        Raises:
+            UsageError: a value that does not fit, or the tip is inside of the object.
+        """
+        changes: dict[str, Any] = {}
+        if "object" in options:
+            changes["object_name"] = objects.canonical(options["object"])
+        if "hidden" in options:
+            given = options["hidden"]
+            changes["hidden"] = given if isinstance(given, Hidden) else Hidden.from_vector(given)
+        if "pose" in options:
+            changes["pose"] = _numbers("pose", options["pose"], 3)
+            changes["tip"] = self.tip + changes["pose"][:2] - self.pose[:2]
+        if "tip" in options:
+            changes["tip"] = _numbers("tip", options["tip"], 2)
+        start = dataclasses.replace(self, **changes)
+        if (start.tip < WORKSPACE_LOW).any() or (start.tip > WORKSPACE_HIGH).any():
+            low, high = WORKSPACE_LOW.tolist(), WORKSPACE_HIGH.tolist()
+            raise UsageError(f"the tip would start at {start.tip.tolist()}; choose tip between {low} and {high}")
+        if start.clearance() < 0:
+            raise UsageError(f"tip {start.tip.tolist()} is inside of the object; choose a place beside it")
+        return start
+
+    def clearance(self) -> float:
+        """Free space between tip and object, metres."""
+        x, y, yaw = self.pose
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        in_object = np.array([[cos, sin], [-sin, cos]]) @ (self.tip - [x, y])
+        return float(pieces.clearance(self.object_name, in_object)) - TIP_RADIUS
+
+
+def draw(names: Sequence[str], rng: np.random.Generator) -> Start:
+    """A random start with one of these objects."""
+    name, hidden = names[rng.integers(len(names))], Hidden.draw(rng)
+    place, yaw = rng.uniform(-OBJECT_AREA, OBJECT_AREA, 2), rng.uniform(-np.pi, np.pi)
+    bearing, distance = rng.uniform(-np.pi, np.pi), rng.uniform(*TIP_DISTANCE)
+    tip = place + distance * np.array([np.cos(bearing), np.sin(bearing)])
+    return Start(name, hidden, np.append(place, yaw), tip, int(rng.integers(2**53)))
+
+
+def _numbers(name: str, value: Any, count: int) -> NDArray[np.float64]:
+    try:
+        numbers = np.asarray(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"option {name} is {value!r}; give {count} numbers") from error
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise UsageError(f"option {name} is {value!r}; give {count} finite numbers")
+    return numbers
