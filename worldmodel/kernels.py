@@ -24,6 +24,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from worldmodel.advection import advect
 from worldmodel.blocks import LSTMState
 from worldmodel.config import ModelConfig, ModelContext
 from worldmodel.trunk import Decoder, scaled
@@ -52,16 +53,6 @@ class KernelHeads(NamedTuple):
     """(B, 3, H, W) logits of the generated picture."""
     kernels: Tensor
     """(B, K, S, S), normalised."""
-
-
-def convolve(picture: Tensor, kernels: Tensor) -> Tensor:
-    """Each picture with each of its kernels, edges repeated: (B, C, H, W) and (B, K, S, S) to (B, K, C, H, W)."""
-    batch, channels, height, width = picture.shape
-    count, size = kernels.shape[1], kernels.shape[-1]
-    pictures = 1 if picture.stride(0) == 0 else batch  # expanded from one: a plain convolution, three times as fast
-    padded = F.pad(picture[:pictures], (size // 2,) * 4, mode="replicate").transpose(0, 1)
-    moved = F.conv2d(padded, kernels.flatten(0, 1).unsqueeze(1), groups=pictures)
-    return moved.view(channels, batch, count, height, width).permute(1, 2, 0, 3, 4)
 
 
 class KernelHead(nn.Module):
@@ -122,7 +113,7 @@ class KernelModel(WorldModel):
         masks = torch.softmax(heads.logits.float(), dim=1)
         now, moving, generated = masks[:, :1], masks[:, 1 : 1 + self.kernel_count], masks[:, 1 + self.kernel_count :]
         blend = now * rgb + generated[:, :1] * torch.sigmoid(heads.generated.float())
-        blend = blend + torch.einsum("bkhw,bkchw->bchw", moving, convolve(rgb, kernels))
+        blend = blend + advect(rgb, moving, kernels)
         if first is not None:
             blend = blend + generated[:, 1:] * first
         return KernelPrediction(blend, masks, None, kernels)
