@@ -11,7 +11,7 @@ from typing import Literal
 
 from tqdm import tqdm
 
-from data_collection.environments import resolve_env, versions
+from data_collection.environments import resolve_env, usual_policy, versions
 from data_collection.files import locked, remove_leftovers
 from data_collection.manifest import MANIFEST_NAME, Manifest, read_manifest
 from data_collection.schema import SHARD_PATTERN, read_shard
@@ -28,15 +28,17 @@ class Config:
     out: Path
     """Folder of the dataset; made if it is not there."""
     env: str = "tabletop"
-    """Environment: a short name (tabletop), or any Gymnasium id whose environment has a `camera`."""
-    scene: str = "C"
-    """Scene, where the environment has several (tabletop: A, B, C, D)."""
+    """Environment: a short name (tabletop, planar-push), or any Gymnasium id whose environment has a `camera`."""
+    scene: str | None = None
+    """Scene or split, where the environment has several (tabletop: A, B, C, D, usually C; planar-push: train,
+    validation, test, all, usually train)."""
     episodes: int = 400
     """Episodes the dataset shall have; a larger number extends it."""
     steps: int = 240
     """Actions in an episode, which has one frame more."""
-    policy: Literal["play", "noise", "random"] = "play"
-    """Who acts: scripted play, smooth coloured noise, or uniform noise."""
+    policy: Literal["play", "push", "noise", "random"] | None = None
+    """Who acts: scripted play (tabletop), scripted pushes (planar-push), smooth coloured noise, or uniform noise;
+    usually the environment's own script."""
     seed: int = 0
     """With the number of an episode it fixes that episode, whatever the number of workers."""
     workers: int = 2
@@ -63,7 +65,7 @@ class Config:
         return Manifest(
             env_id=env_id,
             env_kwargs={**env_kwargs, "image_size": self.image_size},
-            policy=self.policy,
+            policy=self.policy or usual_policy(self.env),
             seed=self.seed,
             steps=self.steps,
             ground_truth=self.ground_truth,

@@ -28,30 +28,51 @@ class KnownEnv:
 
     env_id: str
     """Gymnasium id; `{scene}` stands for the scene's letter."""
+    policy: str = "play"
+    """Who acts unless told otherwise."""
     scenes: tuple[str, ...] = ()
+    """The first is taken unless told otherwise."""
+    scene_keyword: str = ""
+    """Keyword argument that a scene goes to; "" if it is part of the id."""
     kwargs: dict[str, Any] = field(default_factory=dict)
 
 
 KNOWN_ENVS: dict[str, KnownEnv] = {
-    "tabletop": KnownEnv("t3vip/Tabletop{scene}-v0", scenes=("A", "B", "C", "D")),
+    "tabletop": KnownEnv("t3vip/Tabletop{scene}-v0", scenes=("C", "A", "B", "D")),
+    "planar-push": KnownEnv("t3vip/PlanarPush-v0", "push", ("train", "validation", "test", "all"), "split"),
 }
 
 
 def resolve_env(name: str, scene: str | None) -> tuple[str, dict[str, Any]]:
     """Short name, or any Gymnasium id ("package/Name-v0", "module:Name-v0") -> (Gymnasium id, keyword arguments).
 
+    Args:
+        name: the short name or the id.
+        scene: one of the environment's scenes; None for its usual one.
+
     Raises:
         UsageError: unknown name or scene.
     """
-    if name not in KNOWN_ENVS:
-        if "/" in name or ":" in name:
-            return name, {}
+    if name not in KNOWN_ENVS and not ("/" in name or ":" in name):
         known_names = ", ".join(KNOWN_ENVS)
         raise UsageError(f"no environment named '{name}'; choose one of {known_names}, or give a Gymnasium id")
-    known = KNOWN_ENVS[name]
-    if known.scenes and scene not in known.scenes:
-        raise UsageError(f"{name} has no scene '{scene}'; choose one of {', '.join(known.scenes)}")
-    return known.env_id.format(scene=scene), dict(known.kwargs)
+    known = KNOWN_ENVS.get(name, KnownEnv(name))
+    if scene is None:
+        scene = known.scenes[0] if known.scenes else ""
+    elif not known.scenes:
+        raise UsageError(f"{name} has no scenes to choose from, but --scene is '{scene}'; leave it out")
+    elif scene not in known.scenes:
+        raise UsageError(f"{name} has no scene '{scene}'; choose one of {', '.join(sorted(known.scenes))}")
+    chosen = {known.scene_keyword: scene} if known.scene_keyword else {}
+    return known.env_id.replace("{scene}", scene), {**known.kwargs, **chosen}
+
+
+def usual_policy(name: str) -> str:
+    """Who acts in an environment, by its short name or Gymnasium id, unless told otherwise."""
+    if name in KNOWN_ENVS:
+        return KNOWN_ENVS[name].policy
+    families = {known.env_id.partition("{")[0]: known.policy for known in KNOWN_ENVS.values()}
+    return next((policy for family, policy in families.items() if family in name), "play")
 
 
 def make_env(env_id: str, env_kwargs: dict[str, Any], ground_truth: bool) -> gymnasium.Env:

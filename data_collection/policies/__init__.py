@@ -5,14 +5,15 @@ from __future__ import annotations
 from data_collection.policies.base import Policy
 from envs.errors import UsageError
 
-POLICIES = ("play", "noise", "random")
+POLICIES = ("play", "push", "noise", "random")
 
 
 def make_policy(name: str) -> Policy:
     """A new policy.
 
     Args:
-        name: "play" (scripted play, looks into the simulator), "noise" (coloured noise) or "random" (uniform).
+        name: "play" and "push" (scripts for the tabletop and for planar pushing, which look into the simulator),
+            "noise" (coloured noise) or "random" (uniform).
 
     Raises:
         UsageError: no such policy.
@@ -21,6 +22,10 @@ def make_policy(name: str) -> Policy:
         from data_collection.policies.play import PlayPolicy
 
         return PlayPolicy()
+    if name == "push":
+        from data_collection.policies.push import PushPolicy
+
+        return PushPolicy()
     if name == "noise":
         from data_collection.policies.coloured_noise import NoisePolicy
 

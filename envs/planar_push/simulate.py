@@ -100,10 +100,14 @@ class BatchSimulator:
         states = np.atleast_2d(np.asarray(states, np.float64))
         size = mujoco.mj_stateSize(model, INTEGRATION_STATE)
         if states.ndim != 2 or states.shape[1] != size + OWN_STATE or len(states) not in (1, count):
-            raise UsageError(f"states have shape {states.shape}; give (1 or {count}, {size + OWN_STATE}) of get_state()")
+            raise UsageError(
+                f"states have shape {states.shape}; give (1 or {count}, {size + OWN_STATE}) of get_state()"
+            )
         identity = slice(size, size + env.hidden.vector().size + 1)
         if not (states[:, identity] == env.get_state()[identity]).all():
-            raise UsageError("a state has another object or other hidden variables than the environment; set_state first")
+            raise UsageError(
+                "a state has another object or other hidden variables than the environment; set_state first"
+            )
         parts = []
         for signature in (PHYSICS_STATE, mujoco.mjtState.mjSTATE_WARMSTART):
             part = np.empty((len(states), mujoco.mj_stateSize(model, signature)))
