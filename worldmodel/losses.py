@@ -14,7 +14,7 @@ from worldmodel.compilation import compiled
 EDGE_SHARPNESS = 10.0
 """How fast smoothness lets go at an edge of a picture in [0, 1]; with the paper's 1 an edge hardly counts."""
 _BEYOND_M = 1e4  # where the cloud ends: farther away than any true neighbour
-_DISTANCES_AT_ONCE = 1 << 22  # of the chamfer distance: 16 MiB of them
+_AT_ONCE = 256  # points whose distances to a whole cloud are taken together
 
 
 @dataclass(frozen=True)
@@ -104,11 +104,16 @@ def nearest_in_window(query: Tensor, reference: Tensor, radius: int) -> Tensor:
         return y * width + x
 
 
+@compiled
+def _nearest_row(points: Tensor, others: Tensor) -> Tensor:
+    """(N,) index of the nearest of `others` (3, M) to each of `points` (3, N); compiled, no distance is ever stored."""
+    return (points[:, :, None] - others[:, None]).square().sum(0).argmin(1)
+
+
 def nearest_of_all(query: Tensor, reference: Tensor) -> Tensor:
     """The nearest reference point of each query point in the whole cloud.
 
-    Some rows of the matrix of distances at a time; the distances themselves, not |a|^2 + |b|^2 - 2ab, which at 4 m is
-    off by millimetres.
+    Some query points at a time, and by differences: |a|^2 + |b|^2 - 2ab is off by millimetres at 4 m.
 
     Args:
         query: (B, 3, H, W) metres.
@@ -118,13 +123,10 @@ def nearest_of_all(query: Tensor, reference: Tensor) -> Tensor:
         (B, H, W) int64, the flat index y * W + x of the nearest reference point.
     """
     batch, _, height, width = query.shape
-    rows = max(1, _DISTANCES_AT_ONCE // (height * width))
     with torch.no_grad():
-        points, others = (cloud.detach().flatten(2).transpose(1, 2).contiguous() for cloud in (query, reference))
+        points, others = query.detach().flatten(2), reference.detach().flatten(2)
         nearest = [
-            torch.cdist(part, others[b], compute_mode="donot_use_mm_for_euclid_dist").argmin(1)
-            for b in range(batch)
-            for part in points[b].split(rows)
+            _nearest_row(part.contiguous(), others[b]) for b in range(batch) for part in points[b].split(_AT_ONCE, 1)
         ]
         return torch.cat(nearest).view(batch, height, width)
 

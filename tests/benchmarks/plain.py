@@ -71,6 +71,13 @@ def knn_alignment(moved: Tensor, target: Tensor, radius: int) -> Tensor:
     return knn_distance(moved, target, radius) + knn_distance(target, moved, radius)
 
 
+def chamfer_alignment(moved: Tensor, target: Tensor) -> Tensor:
+    """`losses.chamfer_alignment` by the matrix of all distances."""
+    points, others = (cloud.flatten(2).transpose(1, 2) for cloud in (moved, target))  # (B, HW, 3)
+    distances = torch.cdist(points, others, compute_mode="donot_use_mm_for_euclid_dist")  # (B, HW, HW)
+    return distances.amin(2).mean() + distances.amin(1).mean()
+
+
 def splat_average(values: Tensor, pixels: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
     """`splatting.splat` in mode `average`: four corners, each added up by index."""
     batch, channels, height, width = values.shape

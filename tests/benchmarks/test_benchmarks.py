@@ -61,6 +61,16 @@ def test_unfolding_finds_the_same_neighbours():
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-7)
 
 
+def test_a_matrix_of_distances_is_the_same_chamfer_distance():
+    moved, target = (cloud.requires_grad_() for cloud in clouds(2, 12))
+    answers = []
+    for chamfer in (losses.chamfer_alignment, plain.chamfer_alignment):
+        loss = chamfer(moved, target)
+        answers.append((loss, *torch.autograd.grad(loss, (moved, target))))
+    for ours, theirs in zip(*answers, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-7)
+
+
 def test_corner_by_corner_lands_in_the_same_place():
     rng = torch.Generator().manual_seed(0)
     values, depth = torch.rand((2, 4, 8, 10), generator=rng), torch.rand((2, 1, 8, 10), generator=rng) - 0.1

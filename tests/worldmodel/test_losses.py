@@ -39,6 +39,31 @@ def test_alignment_looks_both_ways():
     assert losses.knn_alignment(target, target, RADIUS) < 1e-5
 
 
+def test_chamfer_distance_is_that_of_brute_force(monkeypatch):
+    monkeypatch.setattr(losses, "_AT_ONCE", 25)  # so that 63 points are no multiple of it
+    moved, target = clouds(5)
+    rows = [[torch.linalg.vector_norm(moved[b, :, y, x, None, None] - target[b], dim=0).flatten()
+             for y in range(7) for x in range(9)] for b in range(2)]  # fmt: skip
+    distances = torch.stack([torch.stack(row) for row in rows])  # (B, HW of moved, HW of target)
+    assert torch.equal(losses.nearest_of_all(moved, target).flatten(1), distances.argmin(2))
+    torch.testing.assert_close(losses.chamfer_distance(moved, target), distances.amin(2).mean())
+    torch.testing.assert_close(losses.chamfer_distance(target, moved), distances.amin(1).mean())
+    both = distances.amin(2).mean() + distances.amin(1).mean()
+    torch.testing.assert_close(losses.chamfer_alignment(moved, target), both)
+
+
+def test_chamfer_is_knn_with_the_whole_picture_for_a_window():
+    moved, target = (cloud.requires_grad_() for cloud in clouds(6))
+    answers = []
+    for weights in (losses.LossWeights(alignment="chamfer"), losses.LossWeights(knn_radius=9)):
+        loss = losses.alignment(moved, target, weights)
+        answers.append((loss, *torch.autograd.grad(loss, (moved, target))))
+    for chamfer, knn in zip(*answers, strict=True):
+        torch.testing.assert_close(chamfer, knn, rtol=0, atol=0)
+    narrow = losses.alignment(moved, target, losses.LossWeights(knn_radius=1))
+    assert narrow > 1.1 * answers[0][0]  # what a window misses
+
+
 def test_gradient_of_the_alignment_is_right_and_finite_where_points_coincide():
     moved, target = clouds(2, 3, 4, 1)
     assert torch.autograd.gradcheck(lambda x: losses.knn_alignment(x, target, 1), (moved.requires_grad_(),))
@@ -51,8 +76,10 @@ def test_gradient_of_the_alignment_is_right_and_finite_where_points_coincide():
 def test_compiled_search_is_the_plain_one():
     query, reference = (cloud.float() for cloud in clouds(3, 6, 8, 1))
     plain = losses.nearest_in_window(query, reference, 1)
+    everywhere = losses.nearest_of_all(query, reference)
     with torch.compiler.set_stance("default"):
         assert torch.equal(losses.nearest_in_window(query, reference, 1), plain)
+        assert torch.equal(losses.nearest_of_all(query, reference), everywhere)
 
 
 @pytest.mark.parametrize(("power", "expected"), [(1, 1.5), (2, 2.5)])

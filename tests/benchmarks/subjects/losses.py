@@ -1,4 +1,4 @@
-"""The kNN loss and the splat, forward and backward."""
+"""The alignment losses and the splat, forward and backward."""
 
 from __future__ import annotations
 
@@ -12,17 +12,22 @@ from tests.benchmarks.timing import median_seconds, peak_mebibytes
 from worldmodel import losses, splatting
 
 PIXEL_M = 0.0115  # width of a pixel on the table, metres
-KNN = {"ours": losses.knn_alignment, "plain": plain.knn_alignment}
+ALIGNMENT: dict[str, Callable[[Tensor, Tensor, int], Tensor]] = {
+    "ours": losses.knn_alignment,
+    "plain": plain.knn_alignment,
+    "chamfer": lambda moved, target, radius: losses.chamfer_alignment(moved, target),
+    "plain chamfer": lambda moved, target, radius: plain.chamfer_alignment(moved, target),
+}
 
 
-def knn_seconds(kind: str, frames: int, size: int, radius: int, repeats: int) -> float:
-    """Seconds of the kNN loss, forward and backward, on this many pairs of clouds."""
-    return median_seconds(_knn(kind, frames, size, radius), repeats)
+def alignment_seconds(kind: str, frames: int, size: int, radius: int, repeats: int) -> float:
+    """Seconds of an alignment loss, forward and backward, on this many pairs of clouds."""
+    return median_seconds(_alignment(kind, frames, size, radius), repeats)
 
 
-def knn_mebibytes(kind: str, frames: int, size: int, radius: int) -> float:
-    """MiB that the kNN loss takes at its peak, forward and backward."""
-    return peak_mebibytes(_knn(kind, frames, size, radius))
+def alignment_mebibytes(kind: str, frames: int, size: int, radius: int) -> float:
+    """MiB that an alignment loss takes at its peak, forward and backward."""
+    return peak_mebibytes(_alignment(kind, frames, size, radius))
 
 
 def splat_seconds(kind: str, frames: int, size: int, repeats: int) -> float:
@@ -54,12 +59,12 @@ def clouds(frames: int, size: int) -> tuple[Tensor, Tensor]:
     return target + 0.01 * torch.randn(target.shape, generator=rng), target
 
 
-def _knn(kind: str, frames: int, size: int, radius: int) -> Callable[[], None]:
+def _alignment(kind: str, frames: int, size: int, radius: int) -> Callable[[], None]:
     moved, target = clouds(frames, size)
     moved.requires_grad_()
 
     def work() -> None:
         moved.grad = None
-        KNN[kind](moved, target, radius).backward()
+        ALIGNMENT[kind](moved, target, radius).backward()
 
     return work
