@@ -17,6 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from data_collection.files import written_aside
 from envs.camera import CameraModel
 from envs.rendering import StaticCamera
+from planning.episode import Record
 from planning.setups import Setup
 
 SIZE = 256  # pixels of each view
@@ -25,6 +26,11 @@ STRIP_FRAMES = 6
 STEPS_PER_FRAME, FPS = 2, 15  # real time, at 30 control steps a second
 GOAL_COLOUR, TCP_COLOUR = (230, 30, 30), (40, 200, 255)
 FINE = 4  # lines are drawn this many times larger, then shrunk: smooth edges
+
+
+def film_path(folder: Path, record: Record) -> Path:
+    """Where the film of an episode is, without the ending."""
+    return folder / f"{record.model}-setup{record.setup:02d}-{record.repeat}"
 
 
 class Studio:
@@ -67,7 +73,9 @@ class Film:
             return
         views = [self._view(camera) for camera in self._studio.cameras]
         left = np.linalg.norm(self._path[-1] - self._setup.goal.point_world)
-        text = f"{self._caption}  step {step}  {100 * left:.1f} cm"
+        camera = self._studio.tabletop.camera  # what the model sees by, so in its pixels
+        seen = camera.project(camera.to_camera(self._path[-1])) - self._setup.goal.pixel
+        text = f"{self._caption}  step {step}  {100 * left:.1f} cm  {np.linalg.norm(seen):.1f} px"
         self.frames.append(_captioned(np.concatenate(views, axis=1), text))
 
     def _view(self, camera: StaticCamera) -> NDArray[np.uint8]:
@@ -75,6 +83,7 @@ class Film:
         way = _pixels(camera.geometry, np.array(self._path))
         u, v = _pixels(camera.geometry, self._setup.goal.point_world[None])[0]
         _draw_lines(picture, [way], TCP_COLOUR, 1)
+        _draw_dot(picture, way[-1], TCP_COLOUR)
         _draw_lines(picture, [[(u - 6, v), (u + 6, v)], [(u, v - 6), (u, v + 6)]], GOAL_COLOUR, 2)
         return np.asarray(picture)
 
@@ -104,6 +113,16 @@ def _draw_lines(
     for line in lines:
         draw.line([(FINE * (u + 0.5), FINE * (v + 0.5)) for u, v in line], 255, FINE * width, joint="curve")
     picture.paste(colour, mask=stencil.resize(picture.size, Image.Resampling.BOX))
+
+
+def _draw_dot(picture: Image.Image, pixel: tuple[float, float], colour: tuple[int, int, int]) -> None:
+    """Draw a dot with a dark rim at a pixel (u, v)."""
+    u, v = (FINE * (place + 0.5) for place in pixel)
+    for radius, fill in ((4.0, (0, 0, 0)), (3.0, colour)):
+        stencil = Image.new("L", (FINE * picture.width, FINE * picture.height))
+        reach = FINE * radius
+        ImageDraw.Draw(stencil).ellipse((u - reach, v - reach, u + reach, v + reach), 255)
+        picture.paste(fill, mask=stencil.resize(picture.size, Image.Resampling.BOX))
 
 
 def _captioned(frame: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ from planning.episode import THRESHOLDS, Record
 from planning.statistics import wilson_interval
 
 AXIS_SPLIT = 0.5  # share of the way along the optical axis that parts "across" from "along"
+AXIS_BINS = (0.0, 0.25, 0.5, 0.75, 1.0)  # bounds of a finer division by that share
+PARTS = ("all", "across", "along")
 
 
 def summarise(records: Sequence[Record]) -> dict[str, Any]:
@@ -31,15 +34,22 @@ def summarise(records: Sequence[Record]) -> dict[str, Any]:
     summary["least_distance_m_median"] = float(np.median([record.least_distance for record in records]))
     summary["initial_distance_m_median"] = float(np.median([record.initial_distance for record in records]))
     summary["plan_seconds_median"] = float(np.median([record.plan_seconds for record in records]))
-    summary["by_axis_share"] = {
-        name: _share(part) for name, part in zip(("across", "along"), _split_by_axis(records), strict=True)
-    }
+    summary["by_axis_share"] = {part: _share([r for r in records if in_part(r, part)]) for part in PARTS[1:]}
+    numbers = np.digitize([record.axis_share for record in records], AXIS_BINS[1:-1])
+    summary["by_axis_bin"] = [
+        {
+            "from": low,
+            "to": high,
+            **_share([record for record, at in zip(records, numbers, strict=True) if at == number]),
+        }
+        for number, (low, high) in enumerate(itertools.pairwise(AXIS_BINS))
+    ]
     return summary
 
 
-def _split_by_axis(records: Sequence[Record]) -> tuple[list[Record], list[Record]]:
-    along = [record for record in records if record.axis_share >= AXIS_SPLIT]
-    return [record for record in records if record.axis_share < AXIS_SPLIT], along
+def in_part(record: Record, part: str) -> bool:
+    """Whether an episode is one of the `across` or `along` setups; all are of `all`."""
+    return part == "all" or (part == "along") == (record.axis_share >= AXIS_SPLIT)
 
 
 def _share(records: Sequence[Record]) -> dict[str, Any]:
@@ -73,6 +83,11 @@ def table(models: dict[str, dict[str, Any]]) -> str:
                 _percent(axis["along"]["success_3d"]),
             ]
         )
+    return aligned(rows)
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> str:
+    """A table as text, its columns flush right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
 

@@ -16,9 +16,11 @@ from tqdm import tqdm
 import envs.command
 from data_collection.files import locked, write_json
 from envs.errors import UsageError
-from planning.controllers import CONTROLLERS, LEARNED, Kit
+from planning.comparison import comparison_chart, difference_table, differences
+from planning.controllers import CONTROLLERS, LEARNED, PIXEL_MODELS, Kit
 from planning.episode import Record, run_episode
-from planning.film import Film, Studio
+from planning.film import Film, Studio, film_path
+from planning.filmstrip import filmstrip
 from planning.icem import ICEMConfig
 from planning.records import EpisodeLog
 from planning.report import bar_chart, summarise, table
@@ -186,22 +188,34 @@ def run_missing(config: ServoConfig, env: gym.Env, studio: Studio, kit: Kit, log
                 env, setup, CONTROLLERS[name](kit), config.steps, repeat, film.watch if film is not None else None
             )
             if film is not None:
-                film.save(config.out / "videos" / f"{name}-setup{index:02d}-{repeat}")
+                film.save(film_path(config.out / "videos", record))
             progress.set_postfix_str(f"{name}: {100 * record.final_distance:.1f} cm left")
             yield record
 
 
 def report(config: ServoConfig, log: EpisodeLog) -> None:
     """Write servo.json and the chart; print the table. Only the episodes that this command asks for count."""
-    models = {
-        name: summarise([log.records[name, setup, repeat] for setup, repeat in config.attempts()])
-        for name in config.model
-    }
-    title = f"servo on scene {config.scene}, {len(config.attempts())} episodes each"
-    write_json(config.out / "servo.json", {"scene": config.scene, "seed": config.seed, "models": models})
+    attempts = config.attempts()
+    records = {name: [log.records[name, setup, repeat] for setup, repeat in attempts] for name in config.model}
+    models = {name: summarise(of_model) for name, of_model in records.items()}
+    paired = differences(records)
+    title = f"servo on scene {config.scene}, {len(attempts)} episodes each"
+    document = {"scene": config.scene, "seed": config.seed, "models": models, "t3vip_less": paired}
+    write_json(config.out / "servo.json", document)
+    written = ["servo.json", "episodes.jsonl", "success.png"]
     bar_chart(models, config.out / "success.png", title)
     print(table(models))
-    print(f"written to {config.out}: servo.json, success.png, episodes.jsonl")
+    if len(models) > 1:
+        comparison_chart(models, config.out / "comparison.png", title)
+        written.append("comparison.png")
+    if paired:
+        print(f"\n{difference_table(paired)}\n")
+    rivals = [name for name in config.model if name in PIXEL_MODELS]
+    if "t3vip" in records and rivals and config.video:
+        filmed = {name: records[name][: config.video] for name in ("t3vip", rivals[0])}
+        if filmstrip(config.out / "videos", filmed, config.out / "filmstrip.png"):
+            written.append("filmstrip.png")
+    print(f"written to {config.out}: {', '.join(written)}")
 
 
 def command() -> None:

@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from worldmodel.advection import convolve
 from worldmodel.geometry import pixel_grid
-from worldmodel.kernels import KernelPrediction, convolve
+from worldmodel.kernels import KernelPrediction
 
 Box = tuple[int, int, int, int]
 """Rows top to bottom and columns left to right of a window, the ends not included."""

@@ -79,10 +79,10 @@ class ExactModel:
 class ExactPixelModel(ExactModel):
     """Shifts the picture as the action says, which it knows of an arm that is 4.2 m away; one kernel does it all."""
 
-    reach = 10
+    reach = 4  # pixels; farther than an action moves anything
 
     def __init__(self, camera: CameraModel, kind: str = "sv2p", **options: Any) -> None:
-        super().__init__(camera, kind=kind, **options)
+        super().__init__(camera, frame_gap=1, kind=kind, **options)
 
     def predict(self, shift):
         pixels = shift[:, :2] * float(self.camera.K[0, 0]) / 4.2  # (N, 2)

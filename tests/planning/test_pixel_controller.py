@@ -11,15 +11,16 @@ from planning.controllers.pixel import PixelController
 from planning.icem import ICEM, ICEMConfig
 
 
-def planner(seed=0, **options):
-    return ICEM(ICEMConfig(**options), -np.ones(3), np.ones(3), np.random.default_rng(seed))
+def planner():
+    config = ICEMConfig(population=24, elites=6, iterations=2)
+    return ICEM(config, -np.ones(3), np.ones(3), np.random.default_rng(0))
 
 
 def pixel_of(world):
     return world.camera.project(world.camera.to_camera(world.tcp))
 
 
-def servo(controller, world, goal, steps=60):
+def servo(controller, world, goal, steps=30):
     """Runs the controller; returns its actions and, after each, the distance in the picture."""
     observation = world.observation()
     controller.reset(observation, goal)
@@ -34,7 +35,7 @@ def servo(controller, world, goal, steps=60):
 def test_reaches_the_pixel_with_an_exact_model(pixel_model, camera, world, goal):
     way = np.linalg.norm(pixel_of(world) - goal.pixel)
     _, distances = servo(PixelController("sv2p", pixel_model, camera, planner()), world, goal)
-    assert way > 15 and (distances <= 0.1 * way).sum() >= 5 and distances[-10:].max() < 0.2 * way
+    assert way > 15 and (distances <= 0.1 * way).sum() >= 5 and distances[-8:].max() < 0.15 * way
 
 
 def test_needs_its_model(make_pixel_model, camera, world, goal):
@@ -76,7 +77,7 @@ def hand_beside(world, camera, du):
 def test_it_is_the_tcp_that_goes_to_the_pixel_not_the_hand(pixel_model, camera, world, goal):
     world.observation = hand_beside(world, camera, -5)
     _, distances = servo(PixelController("sv2p", pixel_model, camera, planner()), world, goal)
-    assert np.median(distances[-15:]) < 1.2  # the hand's mean is 2.5 pixels beside
+    assert np.median(distances[-8:]) < 1.0  # the hand's mean is 2.5 pixels beside
 
 
 def test_designated_are_the_pixels_of_the_hand_in_both_frames(pixel_model, camera, world, goal):
