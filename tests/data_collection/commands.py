@@ -15,6 +15,8 @@ HERE = Path(__file__).parent
 
 MODULES = {
     "collect-rollouts": "data_collection.collect",
+    "export-dataset": "data_collection.export_dataset",
+    "import-dataset": "data_collection.import_dataset",
     "inspect-dataset": "data_collection.inspect_dataset",
 }
 ENV_ID = "standin:standin/Square-v0"

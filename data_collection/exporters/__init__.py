@@ -1,0 +1,1 @@
+"""Exports of a dataset into the formats of other projects."""
