@@ -35,7 +35,6 @@ def main(options: TrainOptions) -> None:
     train, validation = _open(options)
     context = _context(train, options)
     kind, architecture = named_config(options.model, options.architecture)
-    options = replace(options, architecture=architecture)
     device = find_device(options.device)
     hashes = {"train": train.dataset.content_hash, "validation": validation.source.dataset.content_hash}
 
@@ -45,7 +44,7 @@ def main(options: TrainOptions) -> None:
         origin = {"options": _document(options), "data": hashes, "versions": {"torch": torch.__version__}}
         return Trainer(model, options, train, validation, origin)
 
-    options = _claimed(options) or _claim(_timed(options, make_trainer))
+    options = existing_run(options) or _claim(_timed(options, make_trainer))
     make_trainer(options).run()
 
 
@@ -114,8 +113,21 @@ def _context(train: ClipSource, options: TrainOptions) -> ModelContext:
     )
 
 
-def _claimed(options: TrainOptions) -> TrainOptions | None:
-    """The options of the run that the folder holds, which must be those given; None where there is no run yet."""
+def parse_options(arguments: Sequence[str]) -> TrainOptions:
+    """The options that `train-worldmodel` makes of these arguments.
+
+    Raises:
+        UsageError: they do not parse, or cannot be.
+    """
+    return command_line.parse(TrainOptions, arguments, _preset)
+
+
+def existing_run(options: TrainOptions) -> TrainOptions | None:
+    """The options of the run that `options.out` holds; None where there is none yet.
+
+    Raises:
+        UsageError: it is a run with other options, or damaged.
+    """
     path = options.out / "config.json"
     if not path.exists():
         return None
@@ -143,7 +155,8 @@ def _claim(options: TrainOptions) -> TrainOptions:
 
 
 def _document(options: TrainOptions) -> dict[str, Any]:
-    document: dict[str, Any] = json.loads(json.dumps(asdict(options), default=str))
+    _, architecture = named_config(options.model, options.architecture)
+    document: dict[str, Any] = json.loads(json.dumps(asdict(replace(options, architecture=architecture)), default=str))
     document.pop("out")
     return document
 
