@@ -2,61 +2,79 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from tqdm import tqdm
+
 from data_collection.dataset import RGBDDataset
+from data_collection.files import write_json, written_aside
 from envs import command as command_line
 from envs.errors import UsageError
-from worldmodel.checkpoint import load_model
+from worldmodel import evaluation_report as report
+from worldmodel.checkpoint import load_inference, load_model
 from worldmodel.clips import ClipSource
+from worldmodel.devices import best_precision, find_device
+from worldmodel.measurement import Measured, Networks, Sampling, measure_copy, measure_model
 from worldmodel.memory import keep_freed_memory
-from worldmodel.validation import Scores, ValidationSet, validate
-
-ROWS = (
-    ("psnr", "RGB PSNR, dB"),
-    ("copy_psnr", "  copying the last frame"),
-    ("depth_rmse", "depth RMSE, m"),
-    ("copy_depth_rmse", "  copying the last frame"),
-    ("flow_error_moving", "scene-flow error, moving pixels (no motion: 1)"),
-    ("flow_error_hand", "scene-flow error, hand (no motion: 1)"),
-    ("false_flow_m", "false flow on still pixels, m"),
-    ("tracking_error", "TCP off after the last step, share of its way"),
-    ("inpainted", "share of inpainted pixels"),
-)
+from worldmodel.perceptual import SMALLEST, PerceptualNetwork
+from worldmodel.perceptual_weights import WeightsUnavailable, load_weights
+from worldmodel.sampling import Selection
+from worldmodel.scores import RESAMPLES, Statistics, score_clips
+from worldmodel.validation import ValidationSet
+from worldmodel.world_model import WorldModel
 
 
 @dataclass(frozen=True)
 class EvaluationOptions:
-    """Score models on free-running prediction with latents at 0, the same clips for all of them.
+    """Score models on free-running prediction, the same clips for all that have the same frame gap.
 
-    The row `NAME without motion` is the same model with every transform replaced by the identity: what its inpainter
-    and its splatting do alone. Flow and tracking are scored where the dataset has ground truth.
+    With --samples 100, as in the paper, a model with latents predicts each clip 100 times from latents of the prior and
+    the best prediction counts; without, and for models without latents, there is one prediction, with latents at 0.
+    Copying the last frame seen stands beside them as `copy`. Flow, disocclusion, segmentation and tracking are scored
+    where the dataset has ground truth (collect-rollouts --ground-truth).
     """
 
     data: Path
     """Dataset that no model was trained on."""
     out: Path = Path("runs/evaluation")
-    """Folder for evaluation.json."""
+    """Folder for evaluation.json, evaluation.md and curves.png."""
     models: tuple[str, ...] = ("t3vip",)
     """Shipped names, training runs, or folders with config.json and model.safetensors."""
     clips: int = 256
     """Clips, spread evenly over the dataset."""
     predicted: int = 10
-    """Frames to predict."""
+    """Frames to predict; more than a model was trained for is allowed, as long as the episodes are that long."""
     context: int = 2
     """Frames that the models see."""
+    samples: int = 0
+    """Futures of each clip of which the best counts; 100 in the paper. 0 for latents at 0 only, which is far faster."""
+    select: Selection = "vgg"
+    """What the best sample is the best in, over all of its frames: `vgg` (lowest LPIPS, as in the paper) or `psnr`. All
+    scores are then those of the sample chosen."""
+    frame_gap: int | None = None
+    """Control steps between frames, instead of what each model was trained with; the actions between are added up."""
+    vgg: bool = True
+    """Score by VGG too. Fetches its weights (60 MB) the first time; without a network the scores are left out."""
+    without_motion: bool = False
+    """Score each model once more with every transform the identity, every kernel a copy: what painting does alone."""
     batch: int = 16
     """Clips at a time."""
+    seed: int = 0
+    """Of the latents and of the resampling that gives the intervals."""
     device: str = "cpu"
-    """Where the models run."""
+    """Where the models run: cpu, cuda, or auto."""
 
     def __post_init__(self) -> None:
         for name in ("clips", "predicted", "context", "batch"):
             if getattr(self, name) < 1:
                 raise UsageError(f"--{name} is {getattr(self, name)}; give at least 1")
+        if self.frame_gap is not None and self.frame_gap < 1:
+            raise UsageError(f"--frame-gap is {self.frame_gap}; give at least 1, or leave it to the models")
+        if self.samples < 0:
+            raise UsageError(f"--samples is {self.samples}; give 0 for latents at 0 only, or for example 100")
         if not self.models:
             raise UsageError("--models is empty; name at least one")
 
@@ -65,53 +83,149 @@ def main(options: EvaluationOptions) -> None:
     """Score, print, write."""
     keep_freed_memory()
     dataset = RGBDDataset(options.data)
-    results: dict[str, Scores] = {}
-    for name in options.models:
-        model = load_model(name, options.device)
-        if (model.camera.height, model.camera.width) != (dataset.camera.height, dataset.camera.width):
-            raise UsageError(
-                f"{name} wants pictures of {model.camera.height}x{model.camera.width}, {options.data} has "
-                f"{dataset.camera.height}x{dataset.camera.width}; collect with another --image-size"
-            )
-        if model.context.action_dim != dataset.action_dim:
-            raise UsageError(
-                f"{name} takes actions of {model.context.action_dim} numbers, {options.data} has {dataset.action_dim}; "
-                "evaluate on data of the environment it was trained in"
-            )
-        source = ClipSource(dataset, model.frame_gap)
-        clips = ValidationSet(
-            source, options.clips, options.context + options.predicted, options.context, options.batch
-        )
-        results[name] = validate(model, clips)
-        results[f"{name} without motion"] = validate(model, clips, still=True)
-        for row in (name, f"{name} without motion"):
-            print(f"\n{row}, {options.data}, {options.clips} clips")
-            print(_table(results[row]))
-    _write(options, dataset, results)
-
-
-def _table(scores: Scores) -> str:
-    lines = []
-    for key, title in ROWS:
-        if key in scores:
-            value = scores[key]
-            shown = "  ".join(f"{v:7.3f}" for v in value) if isinstance(value, list) else f"{value:7.4f}"
-            lines.append(f"{title:48} {shown}")
-    return "\n".join(lines)
-
-
-def _write(options: EvaluationOptions, dataset: RGBDDataset, results: dict[str, Scores]) -> None:
-    document: dict[str, Any] = {
-        "data": {"path": str(options.data), "env_id": dataset.attrs["env_id"], "hash": dataset.content_hash},
-        "clips": options.clips,
-        "models": results,
-    }
+    models = {name: load_model(name, options.device) for name in options.models}
+    for name, model in models.items():
+        _check(name, model, dataset, options)
+    gaps = sorted({options.frame_gap or model.frame_gap for model in models.values()})
+    sets = _clip_sets(dataset, gaps, options)
     options.out.mkdir(parents=True, exist_ok=True)
-    path = options.out / "evaluation.json"
-    aside = path.with_suffix(".tmp")
-    aside.write_text(json.dumps(document, indent=2) + "\n")
-    aside.replace(path)
-    print(f"\n{path}")
+    networks, notes = _networks(options, dataset)
+    select: Selection = options.select if networks is not None else "psnr"
+    sampling = Sampling(options.samples, select, options.seed) if options.samples else None
+    copies: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
+    with tqdm(total=sum(len(_starts(sets[g])) for g in gaps), unit="clip", dynamic_ncols=True) as bar:
+        bar.total += sum(len(_starts(sets[options.frame_gap or model.frame_gap])) for model in models.values())
+        for gap in gaps:
+            name = "copy" if len(gaps) == 1 else f"copy at gap {gap}"
+            bar.set_description(name)
+            copied = measure_copy(sets[gap], networks, bar.update)
+            copies[name] = {"frame_gap": gap, "prediction": name} | _scored(copied, sets[gap], options)
+        for name, model in models.items():
+            bar.set_description(name)
+            data = sets[options.frame_gap or model.frame_gap]
+            inference = load_inference(name, model)
+            measured = measure_model(model, data, networks, sampling, inference, options.without_motion, bar.update)
+            entries[name] = _entry(measured, data, options, sampling, bool(model.latent_channels))
+            bar.write(report.line(name, entries[name]))
+            document = _document(options, dataset, sets, select, notes, {**entries, **copies})
+            _write(options.out, document)
+    print(f"\n{report.markdown(document)}")
+    for file in ("evaluation.json", "evaluation.md", "curves.png"):
+        print(options.out / file)
+
+
+def _check(name: str, model: WorldModel, dataset: RGBDDataset, options: EvaluationOptions) -> None:
+    if (model.camera.height, model.camera.width) != (dataset.camera.height, dataset.camera.width):
+        raise UsageError(
+            f"{name} wants pictures of {model.camera.height}x{model.camera.width}, {options.data} has "
+            f"{dataset.camera.height}x{dataset.camera.width}; collect with another --image-size"
+        )
+    if model.context.action_dim != dataset.action_dim:
+        raise UsageError(
+            f"{name} takes actions of {model.context.action_dim} numbers, {options.data} has {dataset.action_dim}; "
+            "evaluate on data of the environment it was trained in"
+        )
+
+
+def _clip_sets(dataset: RGBDDataset, gaps: list[int], options: EvaluationOptions) -> dict[int, ValidationSet]:
+    """The clips for each frame gap; the pictures are held in memory once."""
+    sets: dict[int, ValidationSet] = {}
+    frames = options.context + options.predicted
+    for gap in gaps:
+        source = ClipSource(dataset, gap, share=sets[gaps[0]].source if sets else None)
+        sets[gap] = ValidationSet(source, options.clips, frames, options.context, options.batch)
+        _starts(sets[gap])  # now, not after the first model: are the episodes long enough?
+    return sets
+
+
+def _starts(data: ValidationSet) -> Any:
+    return data.source.spread(data.clips, data.frames)
+
+
+def _networks(options: EvaluationOptions, dataset: RGBDDataset) -> tuple[Networks | None, list[str]]:
+    """What judges by VGG, and what the reader of the report must know where there is none."""
+    reason = "The VGG scores were left out (--no-vgg)"
+    if options.vgg and min(dataset.camera.height, dataset.camera.width) < SMALLEST:
+        reason = f"The VGG scores are left out: they need pictures of at least {SMALLEST} pixels a side"
+    elif options.vgg:
+        try:
+            weights = load_weights()
+        except WeightsUnavailable as error:
+            reason = f"The VGG scores are left out: {error}"
+        else:
+            device = find_device(options.device)
+            deciding = PerceptualNetwork(weights).to(device)
+            precision = best_precision(device)
+            same = precision == deciding.precision
+            return Networks(deciding if same else PerceptualNetwork(weights, precision).to(device), deciding), []
+    if options.samples and options.select == "vgg":
+        reason += "; the best sample is chosen by PSNR"
+    print(reason)
+    return None, [reason]
+
+
+def _scored(statistics: Statistics, data: ValidationSet, options: EvaluationOptions) -> dict[str, Any]:
+    stops = data.source.dataset.episode_slices[:, 1]
+    return score_clips(statistics, np.searchsorted(stops, _starts(data), side="right"), options.seed)
+
+
+def _entry(
+    measured: Measured, data: ValidationSet, options: EvaluationOptions, sampling: Sampling | None, stochastic: bool
+) -> dict[str, Any]:
+    """One model's entry: the best sample's scores where there are samples; motion is that of latents at 0."""
+    kinds = measured.kinds
+    scored = {kind: _scored(statistics, data, options) for kind, statistics in kinds.items()}
+    prediction = "latents at 0" if stochastic else "deterministic"
+    entry = scored["zero"]
+    if "best" in kinds:
+        assert sampling is not None
+        prediction = f"best of {sampling.samples} by {sampling.select.upper()}"
+        entry = _scored({**kinds["zero"], **kinds["best"]}, data, options)
+    entry = {"frame_gap": data.source.frame_gap, "prediction": prediction, **entry}
+    if "best" in kinds:
+        entry["latents_zero"] = scored["zero"]
+    if "still" in kinds:
+        entry["without_motion"] = scored["still"]
+    if "posterior" in kinds:
+        assert measured.latents is not None
+        entry["posterior"] = scored["posterior"]
+        gap = scored["posterior"]["psnr"] - scored["zero"]["psnr"]
+        entry["latents"] = {**measured.latents, "psnr_gap": gap}
+    else:
+        entry["latents"] = None
+    return entry
+
+
+def _document(
+    options: EvaluationOptions,
+    dataset: RGBDDataset,
+    sets: dict[int, ValidationSet],
+    select: Selection,
+    notes: list[str],
+    models: dict[str, Any],
+) -> dict[str, Any]:
+    return {
+        "data": {"path": str(options.data), "env_id": dataset.attrs["env_id"], "hash": dataset.content_hash},
+        "protocol": {
+            "clips": max(len(_starts(data)) for data in sets.values()),
+            "context": options.context,
+            "predicted": options.predicted,
+            "samples": options.samples,
+            "select": select,
+            "seed": options.seed,
+            "resamples": RESAMPLES,
+            "notes": notes,
+        },
+        "models": models,
+    }
+
+
+def _write(folder: Path, document: dict[str, Any]) -> None:
+    write_json(folder / "evaluation.json", document)
+    with written_aside(folder / "evaluation.md") as aside:
+        aside.write_text(report.markdown(document))
+    report.draw_curves(document, folder / "curves.png")
 
 
 def command() -> None:

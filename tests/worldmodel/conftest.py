@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -139,6 +140,18 @@ def tiny_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def source(tiny_dataset: Path) -> ClipSource:
     return ClipSource(RGBDDataset(tiny_dataset), 3)
+
+
+@pytest.fixture(scope="session")
+def random_vgg() -> dict[str, torch.Tensor]:
+    """Weights for a PerceptualNetwork that has seen nothing."""
+    generator = torch.Generator().manual_seed(0)
+    widths = (3, 64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512)
+    weights = {f"linear{i}": torch.rand(c, generator=generator) / c for i, c in enumerate((64, 128, 256, 512, 512))}
+    for i, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
+        weights[f"conv{i}.weight"] = torch.randn((outputs, inputs, 3, 3), generator=generator) / (9 * inputs) ** 0.5
+        weights[f"conv{i}.bias"] = 0.1 * torch.randn(outputs, generator=generator)
+    return weights
 
 
 @pytest.fixture

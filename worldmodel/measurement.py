@@ -1,0 +1,172 @@
+"""What is measured of a model, or of copying the last frame, on every clip of a held-out set."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from worldmodel.clips import Clips, ClipTruth
+from worldmodel.inference import InferenceNetwork
+from worldmodel.latents import LatentUse
+from worldmodel.metrics import relative_depth_error, squared_error, ssim
+from worldmodel.motion_scores import motion_statistics, no_motion, predicted_motion, true_motion
+from worldmodel.perceptual import PerceptualNetwork
+from worldmodel.rollout import Rollout, unroll
+from worldmodel.sampling import Selection, best_future, draw_latents, predict_futures
+from worldmodel.scores import Statistics, join
+from worldmodel.t3vip import T3VIP
+from worldmodel.validation import MIN_WAY_M, ValidationSet, track_tcp
+from worldmodel.world_model import WorldModel
+
+Tick = Callable[[int], Any]
+"""Told how many more clips are done."""
+
+
+@dataclass(frozen=True)
+class Networks:
+    """What judges pictures like VGG; see `sampling.best_future`."""
+
+    ranking: PerceptualNetwork
+    deciding: PerceptualNetwork
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How the best of many futures is found.
+
+    Args:
+        samples: N, for each clip.
+        select: what it is the best in, all predicted frames taken together.
+        seed: of the latents.
+    """
+
+    samples: int
+    select: Selection
+    seed: int = 0
+
+
+@dataclass
+class Measured:
+    """Statistics of all clips by kind of prediction: `zero`, `best`, `still`, `posterior`; and the latents' use."""
+
+    kinds: dict[str, Statistics]
+    latents: dict[str, Any] | None = None
+
+
+@torch.inference_mode()
+def measure_copy(data: ValidationSet, networks: Networks | None, tick: Tick) -> Statistics:
+    """Copying the last context frame, in colour and depth; nothing moves."""
+    parts, c = [], data.context
+    for clips, starts in data.batches():
+        rgb, depth = clips.rgb[:, c - 1 : c].expand_as(clips.rgb[:, c:]), clips.depth[:, c - 1 : c]
+        statistics = _frames(rgb, depth.expand_as(clips.depth[:, c:]), clips, c, networks)
+        statistics["inpainted"] = torch.zeros_like(statistics["se"])
+        if data.source.dataset.has_ground_truth:
+            truth = data.source.truth_at(starts, data.frames)
+            moved = true_motion(data.source.dataset.camera, clips, truth, c)
+            statistics |= motion_statistics(no_motion(moved), moved, truth.hand[:, c - 1 :])
+            way = (truth.tcp[:, -1] - truth.tcp[:, c - 1]).norm(dim=1)
+            statistics |= _tracking(way, way)
+        parts.append(statistics)
+        tick(len(starts))
+    return join(parts)
+
+
+@torch.inference_mode()
+def measure_model(
+    model: WorldModel,
+    data: ValidationSet,
+    networks: Networks | None = None,
+    sampling: Sampling | None = None,
+    inference: InferenceNetwork | None = None,
+    still: bool = False,
+    tick: Tick = lambda clips: None,
+) -> Measured:
+    """Free-running prediction after the context, and motion one step ahead of true frames.
+
+    Args:
+        model: in evaluation mode.
+        data: the clips.
+        networks: for the VGG scores.
+        sampling: find the best of many futures of a model with latents; with None there is no kind `best`.
+        inference: of the model, for the kind `posterior`: latents at the mean of q(z | clip).
+        still: measure the kind `still` too: the same model with every transform the identity, or every kernel a copy.
+        tick: told of progress.
+    """
+    parts: dict[str, list[Statistics]] = defaultdict(list)
+    use = LatentUse()
+    c = data.context
+    for clips, starts in data.batches():
+        clips = clips.to(model.device)
+        truth = data.source.truth_at(starts, data.frames) if data.source.dataset.has_ground_truth else None
+        for kind in ["zero"] + ["still"] * still:
+            free = unroll(model, clips, c, still=kind == "still")
+            statistics = _free(model, free, clips, c, networks)
+            if isinstance(model, T3VIP) and truth is not None:
+                statistics |= _tracking(*track_tcp(model, clips, truth, free, c))
+                statistics |= _taught(model, data, clips, truth, kind == "still")
+            parts[kind].append(statistics)
+        if inference is not None:
+            mean = use.infer(model, inference, clips)
+            parts["posterior"].append(_free(model, unroll(model, clips, c, mean), clips, c, networks))
+        if sampling is not None and model.latent_channels:
+            for b, start in enumerate(starts.tolist()):
+                clip = Clips(clips.rgb[b : b + 1], clips.depth[b : b + 1], clips.actions[b : b + 1])
+                parts["best"].append(_best(model, clip, start, c, networks, sampling))
+                tick(1)
+        else:
+            tick(len(starts))
+    return Measured({kind: join(some) for kind, some in parts.items()}, use.summary() if inference else None)
+
+
+def _frames(rgb: Tensor, depth: Tensor | None, clips: Clips, context: int, networks: Networks | None) -> Statistics:
+    """Of predicted frames (B, P, C, H, W), (B, P) each."""
+    rgb, true = rgb.clamp(0, 1), clips.rgb[:, context:]
+    shape, flat, flat_true = rgb.shape[:2], rgb.flatten(0, 1), true.flatten(0, 1)
+    statistics = {"se": squared_error(rgb, true), "ssim": ssim(flat, flat_true).view(shape)}
+    if networks is not None:
+        lpips, cosine = networks.deciding(flat, flat_true)
+        statistics |= {"lpips": lpips.view(shape), "cosine": cosine.view(shape)}
+    if depth is not None:
+        true_depth = clips.depth[:, context:]
+        statistics["depth_se"] = squared_error(depth, true_depth)
+        statistics["depth_absrel"] = relative_depth_error(depth, true_depth)
+    return statistics
+
+
+def _free(model: WorldModel, free: Rollout, clips: Clips, context: int, networks: Networks | None) -> Statistics:
+    rgb = free.stack("rgb")[:, context - 1 :]
+    if not isinstance(model, T3VIP):
+        return _frames(rgb, None, clips, context, networks)
+    statistics = _frames(rgb, free.stack("depth")[:, context - 1 :], clips, context, networks)
+    return statistics | {"inpainted": free.stack("occlusion")[:, context - 1 :].mean((2, 3, 4))}
+
+
+def _taught(model: T3VIP, data: ValidationSet, clips: Clips, truth: ClipTruth, still: bool) -> Statistics:
+    camera, c = data.source.dataset.camera, data.context
+    predicted = predicted_motion(unroll(model, clips, c, truth=1.0, still=still), c)
+    return motion_statistics(predicted, true_motion(camera, clips, truth, c), truth.hand[:, c - 1 :])
+
+
+def _tracking(error: Tensor, way: Tensor) -> Statistics:
+    counts = way > MIN_WAY_M
+    return {"tcp_error": (error * counts).unsqueeze(1), "way": (way * counts).unsqueeze(1)}
+
+
+def _best(
+    model: WorldModel, clip: Clips, start: int, context: int, networks: Networks | None, sampling: Sampling
+) -> Statistics:
+    steps = clip.rgb.shape[1] - context
+    latents = draw_latents(model, sampling.samples, steps, (sampling.seed, start))
+    futures = predict_futures(model, clip, context, latents)
+    judges = (networks.ranking, networks.deciding) if networks is not None and sampling.select == "vgg" else None
+    chosen = futures.pick(best_future(futures, clip.rgb[:, context:], judges))
+    statistics = _frames(chosen.rgb, chosen.depth, clip, context, networks)
+    if chosen.inpainted is not None:
+        statistics["inpainted"] = chosen.inpainted
+    return statistics
