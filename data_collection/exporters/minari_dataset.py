@@ -61,9 +61,7 @@ def export_minari(
         from minari.dataset.minari_storage import MinariStorage
         from minari.storage.datasets_root_dir import get_dataset_path
     except ImportError as error:
-        raise UsageError(
-            f"Minari cannot be imported ({error}); install it with: pip install 't3vip[minari]'"
-        ) from error
+        raise UsageError(f"Minari cannot be imported ({error}); install it with: pip install 'minari<0.5.4'") from error
     try:
         parse_dataset_id(name)
     except (ValueError, TypeError) as error:

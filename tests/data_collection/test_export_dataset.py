@@ -73,7 +73,7 @@ def test_an_interrupted_export_leaves_nothing(folder, tmp_path, monkeypatch):
 def test_without_minari_the_remedy_is_named(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "minari", None)
     result = call("export-dataset", [folder, "--to", "minari", "--name", "d-v0", "--out", tmp_path])
-    assert_one_line_error(result, "t3vip[minari]")
+    assert_one_line_error(result, "pip install 'minari<0.5.4'")
 
 
 class TheirReader:
