@@ -16,6 +16,7 @@ import torch
 from data_collection.dataset import RGBDDataset
 from envs.command import parse, run
 from worldmodel import run_study, train
+from worldmodel.budget import Cost
 from worldmodel.checkpoint import load_model
 from worldmodel.clips import ClipSource
 from worldmodel.evaluate import EvaluationOptions
@@ -138,12 +139,13 @@ def test_two_models_are_trained_scored_and_put_beside_the_papers(study, data):
     assert code == 2 and "holds the study 'table', not 'ablation'" in err
 
 
-def test_models_are_trained_by_the_clock(study):
-    code, err, trained = study("--minutes", 0.2, "--only", "cdna", "--gap", GAP)
+def test_models_are_trained_by_the_clock(study, monkeypatch):
+    monkeypatch.setattr(train, "measure_cost", lambda make, options: Cost(step=1.999, validation=0, checkpoint=0))
+    code, err, trained = study("--minutes", 0.1, "--only", "cdna", "--gap", GAP)
     assert code == 0 and trained == ["cdna-gap3"], err
     entry = document(study.out)["models"]["cdna-gap3"]
-    assert entry["training"]["steps"] > 3 and "--minutes 0.2" in entry["command"]
-    assert json.loads((study.out / "models/cdna-gap3/config.json").read_text())["steps"] == entry["training"]["steps"]
+    assert entry["training"]["steps"] == 3 and "--minutes 0.1" in entry["command"]
+    assert json.loads((study.out / "models/cdna-gap3/config.json").read_text())["steps"] == 3
 
 
 @pytest.mark.parametrize(
@@ -235,6 +237,9 @@ def test_findings_name_who_is_ahead_and_who_is_not():
     assert "ahead of its rivals in 2 of 3" in rivals
     assert "not ahead of SV2P in PSNR at gap 3, 10 frames (23.500 against 22.000)" in rivals and "CDNA" not in rivals
     assert "CDNA in PSNR" in copied and "T3VIP in depth RMSE" in copied and "SV2P" not in copied
+    models["b"]["latents_zero"], models["a"]["latents_zero"], models["c"]["latents_zero"] = scores(21.0), None, None
+    _, single, _ = findings(document)
+    assert single == "With latents at 0, " + rivals.replace("2 of 3", "2 of 2").split(";")[0] + "."
     flow = {"M1": 0.9, "M2": 1.0, "M3": 0.3, "M4": 0.2, "M5": 0.2, "M6": 0.1}
     document["study"] = "ablation"
     document["models"] = {

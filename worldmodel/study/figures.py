@@ -14,6 +14,7 @@ from worldmodel.study.paper import METRICS
 
 _SCORES = [score for name in METRICS for score in SCORES if score.name == name]
 _GREY = "0.45"
+_COPY = "last frame copied"
 
 Document = dict[str, Any]
 
@@ -33,7 +34,7 @@ def draw_curves(document: Document, path: Path) -> None:
                     panel.plot(range(1, len(curve) + 1), curve, color=colours[model["title"]], label=model["title"])
             curve = document["copy"][str(gap)]["curves"].get(score.name)
             if curve:
-                panel.plot(range(1, len(curve) + 1), curve, "--", color=_GREY, label="last frame copied")
+                panel.plot(range(1, len(curve) + 1), curve, "--", color=_GREY, label=_COPY)
             panel.set_title(f"{score.title} {ARROWS[score.better]}", fontsize=9)
             panel.tick_params(labelsize=8)
             panel.grid(alpha=0.3)
@@ -71,7 +72,7 @@ def draw_bars(document: Document, path: Path) -> None:
                     heights += [value, *(ends or ())]
             copied = document["copy"][str(gap)]["horizons"][last][score.name]
             if copied is not None:
-                panel.plot([at - 0.45, at + 0.45], [copied, copied], "--", color=_GREY, label="last frame copied")
+                panel.plot([at - 0.45, at + 0.45], [copied, copied], "--", color=_GREY, label=_COPY)
                 heights.append(copied)
         _zoom(panel, heights, score)
         panel.set_xticks(range(len(gaps)), [f"gap {gap}" for gap in gaps])
@@ -85,6 +86,7 @@ def draw_bars(document: Document, path: Path) -> None:
 def _zoom(panel: Any, heights: list[float], score: Score) -> None:
     """Errors are shown from 0; likenesses, which never come near 0, from below the lowest."""
     if score.better == "higher":
+        panel.set_ylabel("axis does not start at 0", fontsize=7, color=_GREY)
         low, high = min(heights), max(heights)
         margin = 0.15 * (high - low) or 0.1 * abs(high)
         panel.set_ylim(low - 2 * margin, high + margin)
@@ -101,6 +103,11 @@ def _legend_and_save(figure: Figure, axes: Any, path: Path) -> None:
         for panel in axes.flatten()
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
     }
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    labels = sorted(handles, key=lambda label: label == _COPY)  # the models in their order, then what is no model
+    columns = min(len(labels), 7)
+    figure.legend(
+        [handles[label] for label in labels], labels, loc="outside lower center", ncols=columns, fontsize=8,
+        frameon=False,
+    )  # fmt: skip
     with written_aside(path) as aside:
         figure.savefig(aside, format="png", dpi=80)

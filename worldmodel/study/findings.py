@@ -22,7 +22,14 @@ def findings(document: Document) -> list[str]:
 
 
 def _against_rivals(document: Document) -> list[str]:
-    """Where T3VIP is ahead of each rival, and where not."""
+    """Where T3VIP is ahead of each rival, and where not: as scored, and with one prediction for every model."""
+    if not any(model.get("latents_zero") for model in document["models"].values()):
+        return _standing(document, "")
+    single = {run: m | {"horizons": m["latents_zero"] or m["horizons"]} for run, m in document["models"].items()}
+    return _standing(document, "") + _standing(document | {"models": single}, "With latents at 0, ")
+
+
+def _standing(document: Document, how: str) -> list[str]:
     ahead, behind = 0, []
     for gap, models in _by_gap(document).items():
         for rival in (m for m in models if m["name"] != "t3vip"):
@@ -37,7 +44,7 @@ def _against_rivals(document: Document) -> list[str]:
     if not ahead and not behind:
         return []
     sentence = (
-        f"T3VIP is ahead of its rivals in {ahead} of {ahead + len(behind)} comparisons (PSNR, SSIM and VGG, each "
+        f"{how}T3VIP is ahead of its rivals in {ahead} of {ahead + len(behind)} comparisons (PSNR, SSIM and VGG, each "
         "rival, gap and horizon)"
     )
     return [sentence + (f"; not ahead of {'; '.join(behind)}." if behind else ".")]

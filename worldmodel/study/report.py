@@ -73,12 +73,12 @@ def _compared(document: Document, gap: int, horizon: str) -> list[str]:
     models = [m for m in document["models"].values() if m["frame_gap"] == gap]
     setting = document["paper"][str(gap)]
     beside = setting is not None and horizon == str(document["settings"]["horizons"][-1])
-    ours = _environment(document)
-    head = [f"{s.title} {ARROWS[s.better]}, {ours}" for s in _COLUMNS]
+    ours = f"ours, {_environment(document)}"
+    head = [f"{_short(s)} {ARROWS[s.better]}, {ours}" for s in _COLUMNS]
     title = f"## Frame gap {gap}, {horizon} frames ahead"
     note: list[str] = []
     if beside:
-        head += [f"{_short(s)}, paper, {setting['dataset']}" for s in _COLUMNS]
+        head += [f"{_short(s)} {ARROWS[s.better]}, paper, {setting['dataset']}" for s in _COLUMNS]
         steps = setting["test_steps"]
         note = [f"Paper: {setting['table']}, {setting['dataset']}, skip = {setting['skip']}, {steps} frames.", ""]
     scores = [m["horizons"][horizon] for m in models]
@@ -129,11 +129,12 @@ def _training(document: Document) -> list[str]:
 def _environment(document: Document) -> str:
     """`Tabletop` of `t3vip/TabletopD-v0`."""
     name = str(document["data"]["test"]["env_id"]).rsplit("/", 1)[-1].split("-v")[0]
-    return "ours, Tabletop" if name.startswith("Tabletop") else f"ours, {name}"
+    return "Tabletop" if name.startswith("Tabletop") else name
 
 
 def _short(score: Score) -> str:
-    return score.title.split(",")[0].split(" (")[0]
+    """`VGG` of `VGG (1 - LPIPS)`."""
+    return score.title.split(" (")[0]
 
 
 def _best(value: float | None, others: Sequence[float | None], score: Score) -> str:
