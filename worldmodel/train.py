@@ -25,6 +25,8 @@ from worldmodel.validation import ValidationSet
 
 TEST_ONLY = "TabletopD-v0"
 """The unseen scene; training or tuning on it would make every figure about generalisation worthless."""
+TEST_SPLITS = ("test", "all")
+"""Of environments whose objects are split, the splits with objects that are for testing."""
 HELD_OUT = 10
 """Without a validation set, one episode in so many is held out."""
 
@@ -68,6 +70,10 @@ def _open(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
         if str(opened.attrs["env_id"]).endswith(TEST_ONLY):
             raise UsageError(
                 f"{opened.path} comes from {TEST_ONLY}, the test scene; train and validate on scene A, B or C"
+            )
+        if opened.attrs["env_kwargs"].get("split") in TEST_SPLITS:
+            raise UsageError(
+                f"{opened.path} holds objects for testing only; collect with --scene train and --scene validation"
             )
     if options.validation is not None:
         held_out = RGBDDataset(options.validation)

@@ -139,6 +139,8 @@ def test_data_that_does_not_do(train, write_dataset, camera_of, tmp_path):
     test_scene = write_dataset(tmp_path / "d", [12, 12], env_id="t3vip/TabletopD-v0")
     assert_one_line(train(data=test_scene), "TabletopD-v0", "test scene")
     assert_one_line(train("--validation", test_scene), "TabletopD-v0", "test scene")
+    test_objects = write_dataset(tmp_path / "objects", [12, 12], env_kwargs={"split": "test"})
+    assert_one_line(train(data=test_objects), "objects", "for testing only")
     assert_one_line(train(data=write_dataset(tmp_path / "one", [30])), "1 episode", "--validation")
     odd = write_dataset(tmp_path / "odd", [12, 12], camera_of(20, 12))
     assert_one_line(train(data=odd), "12x20 is no multiple of 8")
