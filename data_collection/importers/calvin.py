@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_collection.importers.calvin_camera import Recording, read_recording
-from data_collection.importers.checks import DepthCheck, check_array, check_gripper, note_unit_of_motion
+from data_collection.importers.checks import DepthCheck, check_array, note_unit_of_motion, odd_gripper
 from data_collection.importers.images import average_colour, nearest_depth, resize_camera
 from data_collection.importers.source import (
     Columns,
@@ -88,7 +88,6 @@ class CalvinSource:
             "scene_obs": ("float", (SCENE_OBS,)),
         }
         depth_check = DepthCheck(self.camera, self.recording.distance, MISREADINGS, self.depth_scale)
-        looked_at = {0, part.frames // 2, part.frames - 1}
         rgb = np.empty((part.frames, height, width, 3), np.uint8)
         depth = np.empty((part.frames, height, width), np.uint16)
         flat = {name: np.empty((part.frames, *shape), np.float64) for name, (_, shape) in list(shapes.items())[2:]}
@@ -99,8 +98,7 @@ class CalvinSource:
                 check_array(frame[key], f"{key} of {name}", kind, shape)
             rgb[row] = average_colour(frame["rgb_static"], height, width)
             metres = nearest_depth(frame["depth_static"], height, width) * self.depth_scale
-            if row in looked_at:
-                depth_check.look(metres)
+            depth_check.look(metres)
             depth[row] = quantise_depth(metres, self.camera.near, self.camera.far)
             for key, values in flat.items():
                 values[row] = frame[key]
@@ -112,8 +110,10 @@ def _columns(
     rgb: NDArray[np.uint8], depth: NDArray[np.uint16], flat: Columns, notes: list[str]
 ) -> tuple[Columns, tuple[str, ...]]:
     actions, robot, scene = flat["rel_actions"][:-1], flat["robot_obs"], flat["scene_obs"]
-    check_gripper(actions[:, 6], "rel_actions")
-    check_gripper(robot[:, 14], "robot_obs")
+    wrong = odd_gripper(actions[:, 6], "rel_actions")
+    if wrong:
+        raise Damaged(wrong)
+    notes += filter(None, [odd_gripper(robot[:, 14], "robot_obs")])  # no model sees it
     largest = float(np.abs(actions[:, :6]).max())
     if largest > 1 + 1e-6:
         notes.append(f"relative actions up to {largest:.3g}, not within -1 and 1")

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from data_collection.importers.source import Damaged
 from envs.camera import CameraModel
 
+SAMPLED_SIDE = 32
+"""About so many rows and columns of a depth picture are looked at."""
 TOLERANCE = 0.1
-"""The median depth may lie outside of the depth range by this share."""
+"""The median depth of a frame may lie outside of the depth range by this share."""
 NAMED_WITHIN = 1.2
 """A wrong unit is named if it explains the median depth up to this factor."""
 DOUBTFUL_WITHIN = 1.15
@@ -44,7 +46,7 @@ def check_array(values: NDArray[Any], name: str, kind: str, shape: Sequence[int]
 
 
 class DepthCheck:
-    """Looks at some depth pictures of a part and says at the end whether they can be metres.
+    """Looks at the depth pictures of a part, one after the other, and says at the end whether they can be metres.
 
     Args:
         camera: of the dataset to be, for its depth range.
@@ -64,39 +66,52 @@ class DepthCheck:
     ) -> None:
         self._camera, self._expected, self._misreadings = camera, expected, misreadings
         self._scale, self._ceiling = scale, ceiling
-        self._seen: list[NDArray[Any]] = []
+        self._medians: list[float] = []
+        self._outside: list[float] = []
+        self._holes: list[float] = []
+        self._greatest = 0.0
 
     def look(self, metres: NDArray[Any]) -> None:
-        """Take a depth picture into account, (H, W)."""
-        self._seen.append(np.asarray(metres, np.float32))
+        """Take the next frame's depth into account, (H, W).
+
+        Raises:
+            Damaged: no pixel of it has a depth.
+        """
+        step = max(1, min(metres.shape) // SAMPLED_SIDE)
+        sample = np.asarray(metres[::step, ::step], np.float32)
+        valid = sample[(sample > 0) & (sample < self._ceiling)]
+        if valid.size == 0:
+            raise Damaged(f"no pixel of frame {len(self._medians)} has a depth")
+        self._medians.append(float(np.median(valid)))
+        self._greatest = max(self._greatest, float(valid.max()))
+        near, far = self._camera.near, self._camera.far
+        self._outside.append(float(((sample < near) | (sample > far)).mean()))
+        self._holes.append(float((sample <= 0).mean()))
 
     def notes(self) -> list[str]:
         """What is odd about the depth that was seen.
 
         Raises:
-            Damaged: it is no depth in metres.
+            Damaged: in some frame it is no depth in metres.
         """
         near, far = self._camera.near, self._camera.far
-        seen = np.stack(self._seen)
-        valid = seen[(seen > 0) & (seen < self._ceiling)]
-        if valid.size == 0:
-            raise Damaged("no pixel has a depth")
-        median = float(np.median(valid))
-        if 0.9 < median <= 1.0 and valid.max() <= 1.0 and near > 1.1:
+        frame = int(np.argmax(np.abs(np.log(np.array(self._medians) / self._expected))))
+        median = self._medians[frame]
+        if 0.9 < median <= 1.0 and self._greatest <= 1.0 and near > 1.1:
             raise Damaged(f"depth looks like a raw z-buffer (median {median:.4f}, none over 1), not like metres")
         error, name, factor = self._best_misreading(median)
+        expected = f"where about {self._expected:.2f} m is expected"
         if not near * (1 - TOLERANCE) <= median <= far * (1 + TOLERANCE):
-            what = f"median depth {median:.4g} m where about {self._expected:.2f} m is expected"
+            what = f"median depth {median:.4g} m in frame {frame} {expected}"
             if error <= math.log(NAMED_WITHIN):
                 raise Damaged(f"depth is {name}: {what}; read it with --depth-scale {self._scale / factor:.6g}")
             raise Damaged(f"{what}, not within {near:g} to {far:g} m; give --depth-scale, or --near and --far")
         notes = []
         if error <= math.log(DOUBTFUL_WITHIN) and abs(math.log(median / self._expected)) > error:
-            notes.append(f"depth may be {name}: median {median:.3g} m where about {self._expected:.2f} m is expected")
-        outside = float(((seen < near) | (seen > far)).mean())
+            notes.append(f"depth may be {name}: median {median:.3g} m in frame {frame} {expected}")
+        outside, holes = float(np.mean(self._outside)), float(np.mean(self._holes))
         if outside > MOST_OUTSIDE:
             notes.append(f"{outside:.0%} of the depth lies outside of {near:g} to {far:g} m and is clipped")
-        holes = float((seen <= 0).mean())
         if holes > MOST_HOLES:
             notes.append(f"{holes:.0%} of the depth is missing (0) and reads as {near:g} m")
         return notes
@@ -109,15 +124,12 @@ class DepthCheck:
         )
 
 
-def check_gripper(values: NDArray[Any], name: str) -> None:
-    """Check that gripper commands, of any shape, are signs.
-
-    Raises:
-        Damaged: one is neither -1 nor 1.
-    """
+def odd_gripper(values: NDArray[Any], name: str) -> str | None:
+    """What is to be said if gripper commands, of any shape, are not all signs."""
     wrong = values[np.abs(values) != 1]
-    if wrong.size:
-        raise Damaged(f"{name} has the gripper at {wrong.flat[0]:.4g} ({wrong.size} of {values.size}), not at -1 or 1")
+    if not wrong.size:
+        return None
+    return f"{name} has the gripper at {wrong.flat[0]:.4g} ({wrong.size} of {values.size}), not at -1 or 1"
 
 
 def note_unit_of_motion(motion: NDArray[Any], actions: NDArray[Any], unit: float) -> list[str]:

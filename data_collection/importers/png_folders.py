@@ -88,8 +88,7 @@ class PngFolders:
             check_array(raw, files["depthsub"][row].name, "uint16", shape)
             rgb[row] = average_colour(colour, height, width)
             metres = nearest_depth(raw, height, width) * (self.png_far * self.depth_scale / DEPTH_STEPS)
-            if row in (0, count // 2, count - 1):
-                depth_check.look(metres)
+            depth_check.look(metres)
             depth[row] = quantise_depth(metres, self.camera.near, self.camera.far)
         actions, proprio, notes = self.robot(part.folder, files, count)
         columns: Columns = {

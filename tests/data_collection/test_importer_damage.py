@@ -42,7 +42,8 @@ CALVIN = {
     ),
     "six numbers": ({"rel_actions": ACTION[:6]}, "rel_actions of episode_0000004.npz is float64 (6,)"),
     "a half-open gripper": ({"rel_actions": np.r_[ACTION[:6], 0.04]}, "gripper at 0.04"),
-    "gripper of the robot": ({"robot_obs": np.r_[ROBOT[:14], 0.0]}, "robot_obs has the gripper at 0"),
+    "one frame without depth": ({"depth_static": DEPTH * 0}, "no pixel of frame 1 has a depth"),
+    "one frame doubled": ({"depth_static": DEPTH * 2}, "doubled: median depth 9.2 m in frame 1"),
     "objects": ({"scene_obs": np.array([{"a": 1}] * 24)}, "episode_0000004.npz does not unpack"),
 }
 
@@ -78,16 +79,16 @@ def test_damaged_calvin_files(tmp_path):
     [
         (
             lambda depth: depth * 2,
-            "doubled: median depth 9.2 m where about 4.20 m is expected; read it with --depth-scale 0.5",
+            "doubled: median depth 9.2 m in frame 0 where about 4.20 m is expected; read it with --depth-scale 0.5",
         ),
         (
             lambda depth: depth / 2,
-            "halved: median depth 2.3 m where about 4.20 m is expected; read it with --depth-scale 2",
+            "halved: median depth 2.3 m in frame 0 where about 4.20 m is expected; read it with --depth-scale 2",
         ),
         (lambda depth: depth * 1000, "in millimetres"),
         (lambda depth: Z_BUFFER, "raw z-buffer"),
         (lambda depth: depth * 0 + 0.1, "median depth 0.1 m"),
-        (lambda depth: depth * 0, "no pixel has a depth"),
+        (lambda depth: depth * 0, "no pixel of frame 0 has a depth"),
     ],
 )
 def test_wrong_units_of_calvin_depth(tmp_path, change, words):
@@ -102,11 +103,13 @@ def test_notes_on_calvin_actions(tmp_path):
     folder = write_calvin(tmp_path / "task_D_D", [(0, 9), (10, 19), (20, 29)])
     for number in range(10, 20):
         change_frame(folder, number, rel_actions=np.r_[0.004, 0, 0, 0, 0, 0, 1])  # metres
+    change_frame(folder, 21, robot_obs=np.r_[ROBOT[:14], 0.0])
     change_frame(folder, 22, rel_actions=np.r_[0.2, 0, 0, 0, 0, -3, 1])
     report = report_of("calvin", folder, tmp_path / "data")
     assert report[0] == ("imported", "")
     assert report[1][0] == "imported" and "moves the arm by 1 m, not by 0.02 m" in report[1][1]
     assert report[2][0] == "imported" and "relative actions up to 3" in report[2][1]
+    assert "robot_obs has the gripper at 0 (1 of 10)" in report[2][1]
 
 
 def test_damaged_dexhand(tmp_path):
@@ -137,7 +140,7 @@ def test_damaged_dexhand(tmp_path):
         6: "rgbsub3.png is uint8 (40, 40)",
         7: "rgbsub3.png does not unpack",
         8: "depth is doubled",
-        9: "in millimetres: median depth 0.1678 m where about 1.08 m is expected; read it with --depth-scale 6.5535",
+        9: "in millimetres: median depth 0.1678 m in frame 0 where about 1.08 m is expected; read it with --depth-scale 6.55",
         10: "0 frames are no episode",
     }.items():
         assert report[number][0] == "damaged" and words in report[number][1], report[number]
