@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import shutil
@@ -128,7 +129,7 @@ def _box(numbers: int) -> gymnasium.spaces.Box:
 def _env_spec(dataset: RGBDDataset) -> gymnasium.envs.registration.EnvSpec | None:
     """Of the environment that the data comes from, so that Minari can make it again; None for the real world."""
     try:
-        spec = gymnasium.spec(dataset.attrs["env_id"])
+        spec = copy.deepcopy(gymnasium.spec(dataset.attrs["env_id"]))  # the registry keeps its own
     except (gymnasium.error.Error, ModuleNotFoundError):
         return None
     spec.kwargs = {**spec.kwargs, **dataset.attrs["env_kwargs"]}
