@@ -29,10 +29,10 @@ demo: setup
 	$(BIN)/check-rendering
 	$(BIN)/servo-eval --model t3vip --episodes 5 --scene D --out $(DEMO) --video 2
 	$(BIN)/collect-rollouts --env tabletop --scene D --episodes 1 --seed 7 --workers 1 --ground-truth --out $(DEMO)/data
-	$(BIN)/view-prediction --model t3vip --data $(DEMO)/data --out $(DEMO)/prediction.png
+	$(BIN)/view-prediction --models t3vip --data $(DEMO)/data --out $(DEMO)/prediction.png $(DEMO)/prediction.mp4
 	@echo "report      $(DEMO)/servo.json, $(DEMO)/success.png"
 	@for video in $(DEMO)/videos/*.mp4; do echo "video       $$video"; done
-	@echo "prediction  $(DEMO)/prediction.png"
+	@echo "prediction  $(DEMO)/prediction.png, $(DEMO)/prediction.mp4"
 
 test: lint
 	$(BIN)/python -m pytest

@@ -1,135 +1,188 @@
-"""Pictures of a prediction beside the truth: RGB, depth, masks, scene flow, optical flow, occlusion."""
+"""Pictures of predictions beside the truth: RGB, depth, masks, scene flow, optical flow, occlusion."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import imageio.v3 as imageio
-import matplotlib
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from envs import ground_truth
+from envs.camera import CameraModel
+from worldmodel import colours
 from worldmodel.clips import Clips, ClipTruth
-from worldmodel.rollout import Rollout, unroll
+from worldmodel.colours import Image
+from worldmodel.figure import TRUTH, Storyboard, Strip, write_sheet
+from worldmodel.legends import DEPTH, MASKS, OCCLUSION, OPTICAL_FLOW, RGB, SCENE_FLOW, Scales
+from worldmodel.rollout import unroll
+from worldmodel.sampling import draw_latents, predict_futures
 from worldmodel.t3vip import CloudPrediction
-from worldmodel.world_model import WorldModel
+from worldmodel.world_model import Prediction, WorldModel
 
-Image = NDArray[np.uint8]
-FLOW_FULL_M = 0.06
-"""Length of a scene flow that gets full colour."""
-
-
-def colour_wheel(flow: Tensor, full: float) -> Image:
-    """A 2D field as colours: the direction is the hue, the length the saturation, still is white.
-
-    Args:
-        flow: (2, H, W), to the right and downwards.
-        full: length of full saturation.
-
-    Returns:
-        (H, W, 3) uint8.
-    """
-    field = flow.detach().float().cpu().numpy()
-    hue = np.arctan2(field[1], field[0]) / (2 * np.pi) % 1.0
-    saturation = np.clip(np.hypot(field[0], field[1]) / full, 0, 1)
-    colours = matplotlib.colors.hsv_to_rgb(np.stack((hue, saturation, np.ones_like(hue)), axis=-1))
-    return (255 * colours).astype(np.uint8)
+MOVES_M, MOVES_PX = 0.001, 0.1
+"""Shorter flow does not count when the colours' full length is chosen."""
 
 
-def wheel_legend(size: int) -> Image:
-    """The colour wheel itself, (size, size, 3) uint8: what colour each direction gets."""
-    axis = torch.linspace(-1, 1, size)
-    v, u = torch.meshgrid(axis, axis, indexing="ij")
-    legend = colour_wheel(torch.stack((u, v)), 1.0)
-    legend[(u.square() + v.square() > 1).numpy()] = 255
-    return legend
+@dataclass(frozen=True)
+class Shown:
+    """What one model says about a clip."""
 
+    name: str
+    """How it is called in the figure."""
+    model: WorldModel
+    predictions: Sequence[Prediction]
+    """Of frames 1 .. T-1, free-running after the context, latents at 0."""
+    samples: Tensor | None = None
+    """(N, P, 3, H, W) the predicted frames again, from N latents of the prior."""
 
-def scene_flow_colours(flow: Tensor, full: float = FLOW_FULL_M) -> Image:
-    """(3, H, W) metres to (H, W, 3) uint8: grey is still; x, y, z add red, green, blue."""
-    return (255 * (0.5 + 0.5 * (flow / full).clamp(-1, 1))).byte().permute(1, 2, 0).cpu().numpy()
-
-
-def depth_colours(depth: Tensor, near: float, far: float) -> Image:
-    """(1, H, W) metres to (H, W, 3) uint8, near is bright."""
-    scaled = ((far - depth[0]) / (far - near)).clamp(0, 1).cpu().numpy()
-    return (255 * matplotlib.colormaps["magma"](scaled)[..., :3]).astype(np.uint8)
-
-
-def mask_colours(masks: Tensor) -> Image:
-    """(K, H, W) masks to (H, W, 3) uint8: the background black, every other mask a colour, blended as the masks are."""
-    palette = torch.from_numpy(matplotlib.colormaps["tab10"](np.arange(masks.shape[0] - 1) % 10)[:, :3]).to(masks)
-    return (255 * torch.einsum("khw,kc->hwc", masks[1:], palette)).byte().cpu().numpy()
-
-
-def _rgb(picture: Tensor) -> Image:
-    return (255 * picture.clamp(0, 1)).round().byte().permute(1, 2, 0).cpu().numpy()
-
-
-def _shadow(mask: Tensor) -> Image:
-    return (255 * mask[0]).byte().unsqueeze(-1).expand(-1, -1, 3).cpu().numpy()
-
-
-def rollout_rows(
-    model: WorldModel, clips: Clips, rollout: Rollout, truth: ClipTruth | None, context: int
-) -> list[list[Image]]:
-    """Rows of pictures of the first clip, one column a predicted step: truth above, prediction below."""
-    near, far = model.camera.near, model.camera.far
-    steps = range(context - 1, len(rollout.predictions))
-    made = [rollout.predictions[t] for t in steps]
-    rows = [
-        [_rgb(clips.rgb[0, t + 1]) for t in steps],
-        [_rgb(p.rgb[0]) for p in made],
-        [mask_colours(p.masks[0]) for p in made],
-    ]
-    clouds = [prediction for prediction in made if isinstance(prediction, CloudPrediction)]
-    if not clouds:
-        return rows
-    rows[2:2] = [
-        [depth_colours(clips.depth[0, t + 1], near, far) for t in steps],
-        [depth_colours(p.depth[0], near, far) for p in clouds],
-    ]
-    if truth is not None:
-        rows.append([scene_flow_colours(truth.scene_flow[0, t]) for t in steps])
-    rows.append([scene_flow_colours(p.scene_flow[0]) for p in clouds])
-    rows.append([colour_wheel(p.optical_flow[0], 5.0) for p in clouds])
-    rows.append([_shadow(p.occlusion[0]) for p in clouds])
-    return rows
-
-
-def tile(rows: list[list[Image]], scale: int = 1, gap: int = 2) -> Image:
-    """Pictures of one size in rows and columns on white, each enlarged `scale` times."""
-    height, width = rows[0][0].shape[:2]
-    height, width = height * scale, width * scale
-    columns = max(map(len, rows))
-    sheet = np.full((len(rows) * (height + gap) - gap, columns * (width + gap) - gap, 3), 255, np.uint8)
-    for r, row in enumerate(rows):
-        for c, picture in enumerate(row):
-            large = picture.repeat(scale, axis=0).repeat(scale, axis=1)
-            sheet[r * (height + gap) : r * (height + gap) + height, c * (width + gap) : c * (width + gap) + width] = (
-                large
-            )
-    return sheet
+    @property
+    def clouds(self) -> list[CloudPrediction]:
+        """The predictions of a model that knows space; none of a model of pictures."""
+        return [prediction for prediction in self.predictions if isinstance(prediction, CloudPrediction)]
 
 
 @torch.inference_mode()
-def picture_prediction(
-    model: WorldModel, clips: Clips, truth: ClipTruth | None, context: int, path: Path, scale: int = 2
-) -> None:
-    """Write a PNG of a free-running prediction of the first clip beside the truth.
+def predict(name: str, model: WorldModel, clips: Clips, context: int, samples: int = 0, seed: int = 0) -> Shown:
+    """Let a model predict the first of some clips.
 
-    Rows: true and predicted RGB, true and predicted depth, masks, true (where known) and predicted scene flow,
-    predicted optical flow on the colour wheel, occlusion; of a model of pictures RGB and masks only. Columns: the
-    predicted steps. The true scene flow starts from true frames, the predicted one from predicted frames.
+    Args:
+        name: how to call it.
+        model: left in the mode it was in.
+        clips: T frames; what comes after the first `context` of them is not looked at.
+        context: frames that the model sees.
+        samples: futures from latents of the prior, besides the one with latents at 0; none of a deterministic model.
+        seed: of these latents.
     """
     was_training = model.training
     model.eval()
-    first = Clips(clips.rgb[:1], clips.depth[:1], clips.actions[:1]).to(model.device)
-    sheet = tile(rollout_rows(model, first, unroll(model, first, context), truth, context), scale)
+    clip = _first(clips).to(model.device)
+    predictions = unroll(model, clip, context).predictions
+    drawn = None
+    if samples and model.latent_shape[0]:
+        latents = draw_latents(model, samples, clip.rgb.shape[1] - context, (seed,))
+        drawn = predict_futures(model, clip, context, latents).rgb.cpu()
     model.train(was_training)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".tmp")
-    aside.write_bytes(imageio.imwrite("<bytes>", sheet, extension=".png"))
-    aside.replace(path)
+    return Shown(name, model, predictions, drawn)
+
+
+def storyboard(clips: Clips, truth: ClipTruth | None, context: int, models: Sequence[Shown]) -> Storyboard:
+    """The paper's qualitative figure of the first clip: in each section the truth, where it is known, and each model.
+
+    What is seen in frame t belongs to column t; so does the motion that led there from frame t-1, and what that
+    motion uncovered. The true flow starts from true frames, the predicted one from predicted frames.
+
+    Args:
+        clips: the clip that the models predicted.
+        truth: motion, where the dataset knows it.
+        context: frames that the models saw.
+        models: at least one, all of one camera and frame gap.
+    """
+    model, blank = models[0].model, [None] * context
+    spatial = [shown for shown in models if shown.clouds]
+    motion = None if truth is None else TrueMotion.of(model.camera, clips, truth)
+    scales = _scales(model.camera, clips, motion, spatial)
+    near, far = scales.near, scales.far
+    strips = [Strip(RGB, TRUTH, [colours.rgb_colours(picture) for picture in clips.rgb[0]])]
+    for shown in models:
+        strips.append(_strip(RGB, shown, context, [colours.rgb_colours(p.rgb[0]) for p in shown.predictions]))
+        for number, future in enumerate(() if shown.samples is None else shown.samples):
+            drawn = [*blank, *(colours.rgb_colours(picture) for picture in future)]
+            strips.append(Strip(RGB, f"{shown.name}, sample {number + 1}", drawn))
+    if spatial:
+        strips.append(Strip(DEPTH, TRUTH, [colours.depth_colours(d, near, far) for d in clips.depth[0]]))
+    for shown in spatial:
+        depths = [colours.depth_colours(p.depth[0], near, far) for p in shown.clouds]
+        strips.append(_strip(DEPTH, shown, context, depths))
+    for shown in models:
+        strips.append(_strip(MASKS, shown, context, [_masks(p, shown.model) for p in shown.predictions]))
+    for section in (SCENE_FLOW, OPTICAL_FLOW, OCCLUSION) if spatial else ():
+        if motion is not None:
+            strips.append(Strip(section, TRUTH, [*blank, *motion.pictures(section, scales)[context - 1 :]]))
+        for shown in spatial:
+            strips.append(_strip(section, shown, context, [_motion(section, p, scales) for p in shown.clouds]))
+    return Storyboard(strips, scales, context, model.frame_gap / model.context.control_rate)
+
+
+@dataclass(frozen=True)
+class TrueMotion:
+    """What the simulator knows about a clip; index t leads from frame t to frame t+1."""
+
+    scene_flow: Tensor
+    """(T-1, 3, H, W) metres."""
+    optical_flow: Tensor
+    """(T-1, 2, H, W) pixels."""
+    occlusion: Tensor
+    """(T-1, 1, H, W), 1 on pixels of frame t+1 on which no point of frame t lands."""
+
+    @classmethod
+    def of(cls, camera: CameraModel, clips: Clips, truth: ClipTruth) -> TrueMotion:
+        """All that follows from depth and scene flow of the first clip."""
+        depth = clips.depth[0, :-1, 0].cpu().numpy()
+        flow = truth.scene_flow[0].permute(0, 2, 3, 1).cpu().numpy()
+        optical = torch.from_numpy(ground_truth.optical_flow(camera, depth, flow)).permute(0, 3, 1, 2)
+        hidden = torch.from_numpy(ground_truth.disocclusion(camera, depth, flow)).float().unsqueeze(1)
+        return cls(truth.scene_flow[0], optical.nan_to_num(), hidden)
+
+    def pictures(self, section: str, scales: Scales) -> list[Image]:
+        """One for each step."""
+        if section == SCENE_FLOW:
+            return [colours.scene_flow_colours(flow, scales.scene_flow) for flow in self.scene_flow]
+        if section == OPTICAL_FLOW:
+            return [colours.colour_wheel(flow, scales.optical_flow) for flow in self.optical_flow]
+        return [colours.occlusion_colours(mask) for mask in self.occlusion]
+
+
+def picture_prediction(
+    model: WorldModel, clips: Clips, truth: ClipTruth | None, context: int, path: Path, scale: int = 2
+) -> None:
+    """Write a PNG of a free-running prediction of the first clip beside the truth; see `storyboard`."""
+    shown = predict(model.kind.upper(), model, clips, context)
+    write_sheet(storyboard(_first(clips), truth, context, [shown]), path, clips.rgb.shape[1] - context, scale)
+
+
+def _first(clips: Clips) -> Clips:
+    return Clips(clips.rgb[:1], clips.depth[:1], clips.actions[:1])
+
+
+def _strip(section: str, shown: Shown, context: int, pictures: list[Image]) -> Strip:
+    """Pictures of all predictions, of which only those after the context are the model's own."""
+    return Strip(section, shown.name, [*[None] * context, *pictures[context - 1 :]])
+
+
+def _masks(prediction: Prediction, model: WorldModel) -> Image:
+    masks = prediction.masks[0]
+    if isinstance(prediction, CloudPrediction):
+        return colours.mask_colours(masks)
+    # Of the current frame, the kernels, the painted picture, and in some models the first frame.
+    last = len(masks) - 1
+    if model.copies_first:
+        return colours.mask_colours(masks, still=(0, last), painted=(last - 1,))
+    return colours.mask_colours(masks, painted=(last,))
+
+
+def _motion(section: str, prediction: CloudPrediction, scales: Scales) -> Image:
+    if section == SCENE_FLOW:
+        return colours.scene_flow_colours(prediction.scene_flow[0], scales.scene_flow)
+    if section == OPTICAL_FLOW:
+        return colours.colour_wheel(prediction.optical_flow[0], scales.optical_flow)
+    return colours.occlusion_colours(prediction.occlusion[0])
+
+
+def _scales(camera: CameraModel, clips: Clips, motion: TrueMotion | None, spatial: Sequence[Shown]) -> Scales:
+    """Colours over what the true clip spans; flow that nobody knows over what the first model predicts."""
+    depth = clips.depth[0].cpu().numpy()
+    inside = depth[depth < camera.far - 1e-3 * (camera.far - camera.near)]
+    near, far = np.quantile(inside, (0.01, 0.99)) if inside.size else (camera.near, camera.far)
+    far = max(far, near + 0.01)
+    if motion is not None:
+        scene, optical = motion.scene_flow, motion.optical_flow
+    elif spatial:
+        scene = torch.cat([prediction.scene_flow for prediction in spatial[0].clouds])
+        optical = torch.cat([prediction.optical_flow for prediction in spatial[0].clouds])
+    else:
+        scene, optical = torch.zeros(3, 1, 1), torch.zeros(2, 1, 1)
+    full = colours.full_length(scene, MOVES_M), colours.full_length(optical, MOVES_PX)
+    return Scales(float(near), float(far), *full)
