@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from data_collection.dataset import RGBDDataset
@@ -22,7 +23,7 @@ from worldmodel.memory import keep_freed_memory
 from worldmodel.perceptual import SMALLEST, PerceptualNetwork
 from worldmodel.perceptual_weights import WeightsUnavailable, load_weights
 from worldmodel.sampling import Selection
-from worldmodel.scores import RESAMPLES, Statistics, score_clips
+from worldmodel.scores import RESAMPLES, Statistics, compare_clips, score_clips
 from worldmodel.validation import ValidationSet
 from worldmodel.world_model import WorldModel
 
@@ -94,6 +95,7 @@ def main(options: EvaluationOptions) -> None:
     sampling = Sampling(options.samples, select, options.seed) if options.samples else None
     copies: dict[str, Any] = {}
     entries: dict[str, Any] = {}
+    headline: dict[int, dict[str, Statistics]] = {gap: {} for gap in gaps}  # what each row's scores are made of
     with tqdm(total=sum(len(_starts(sets[g])) for g in gaps), unit="clip", dynamic_ncols=True) as bar:
         bar.total += sum(len(_starts(sets[options.frame_gap or model.frame_gap])) for model in models.values())
         for gap in gaps:
@@ -101,12 +103,19 @@ def main(options: EvaluationOptions) -> None:
             bar.set_description(name)
             copied = measure_copy(sets[gap], networks, bar.update)
             copies[name] = {"frame_gap": gap, "prediction": name} | _scored(copied, sets[gap], options)
+            headline[gap][name] = copied
         for name, model in models.items():
             bar.set_description(name)
-            data = sets[options.frame_gap or model.frame_gap]
+            gap = options.frame_gap or model.frame_gap
+            data = sets[gap]
             inference = load_inference(name, model)
             measured = measure_model(model, data, networks, sampling, inference, options.without_motion, bar.update)
             entries[name] = _entry(measured, data, options, sampling, bool(model.latent_channels))
+            entries[name]["less"] = {
+                other: compare_clips(measured.headline, statistics, _episodes(data), options.seed)
+                for other, statistics in headline[gap].items()
+            }
+            headline[gap][name] = measured.headline
             bar.write(report.line(name, entries[name]))
             document = _document(options, dataset, sets, select, notes, {**entries, **copies})
             _write(options.out, document)
@@ -139,7 +148,7 @@ def _clip_sets(dataset: RGBDDataset, gaps: list[int], options: EvaluationOptions
     return sets
 
 
-def _starts(data: ValidationSet) -> Any:
+def _starts(data: ValidationSet) -> NDArray[np.int64]:
     return data.source.spread(data.clips, data.frames)
 
 
@@ -166,8 +175,12 @@ def _networks(options: EvaluationOptions, dataset: RGBDDataset) -> tuple[Network
 
 
 def _scored(statistics: Statistics, data: ValidationSet, options: EvaluationOptions) -> dict[str, Any]:
-    stops = data.source.dataset.episode_slices[:, 1]
-    return score_clips(statistics, np.searchsorted(stops, _starts(data), side="right"), options.seed)
+    return score_clips(statistics, _episodes(data), options.seed)
+
+
+def _episodes(data: ValidationSet) -> NDArray[np.int64]:
+    """The episode that each clip is from."""
+    return np.searchsorted(data.source.dataset.episode_slices[:, 1], _starts(data), side="right")
 
 
 def _entry(
@@ -181,7 +194,7 @@ def _entry(
     if "best" in kinds:
         assert sampling is not None
         prediction = f"best of {sampling.samples} by {sampling.select.upper()}"
-        entry = _scored({**kinds["zero"], **kinds["best"]}, data, options)
+        entry = _scored(measured.headline, data, options)
     entry = {"frame_gap": data.source.frame_gap, "prediction": prediction, **entry}
     if "best" in kinds:
         entry["latents_zero"] = scored["zero"]

@@ -41,6 +41,9 @@ def markdown(document: Mapping[str, Any]) -> str:
             "",
             *_table(moved, motion),
         ]
+    compared = _comparisons(models)
+    if compared:
+        lines += ["", "Differences on the same clips, episodes resampled together:", "", *compared]
     used = [(name, entry["latents"]) for name, entry in models.items() if entry.get("latents")]
     if used:
         head = "| latents | active units | KL(posterior, prior), nats | PSNR gain of the posterior mean, dB |"
@@ -70,14 +73,29 @@ def _table(rows: Rows, scores: Sequence[Score]) -> list[str]:
     return lines
 
 
+def _comparisons(models: Mapping[str, Entry]) -> list[str]:
+    """Each model less those above it in the table and less copying."""
+    pairs = [(f"{name} less {other}", gap) for name, e in models.items() for other, gap in e.get("less", {}).items()]
+    shown = [s for s in SCORES if s.name in PICTURE_SCORES and any(s.name in gap for _, gap in pairs)]
+    lines = ["| | " + " | ".join(f"{score.title} {ARROWS[score.better]}" for score in shown) + " |"]
+    lines.append("|---" * (len(shown) + 1) + "|")
+    for title, gap in pairs:
+        cells = [_value(*gap[s.name].values(), s.digits, "+") if s.name in gap else "–" for s in shown]
+        lines.append("| " + " | ".join([title, *cells]) + " |")
+    return lines if shown else []
+
+
 def _cell(entry: Entry, score: Score) -> str:
-    value = entry.get(score.name)
+    return _value(entry.get(score.name), entry["intervals"].get(score.name), score.digits)
+
+
+def _value(value: float | None, interval: Sequence[float] | None, digits: int, sign: str = "") -> str:
+    """A number and, where it is not a point, its interval."""
     if value is None:
         return "–"
-    text = f"{value:.{score.digits}f}"
-    ends = entry["intervals"].get(score.name)
-    if ends and ends[0] is not None and ends[0] != ends[1]:
-        text += f" [{ends[0]:.{score.digits}f}, {ends[1]:.{score.digits}f}]"
+    text = f"{value:{sign}.{digits}f}"
+    if interval and interval[0] != interval[1]:
+        text += f" [{interval[0]:{sign}.{digits}f}, {interval[1]:{sign}.{digits}f}]"
     return text
 
 

@@ -57,6 +57,11 @@ class Measured:
     kinds: dict[str, Statistics]
     latents: dict[str, Any] | None = None
 
+    @property
+    def headline(self) -> Statistics:
+        """Of the best of many where there are many; motion is that of latents at 0 in any case."""
+        return {**self.kinds["zero"], **self.kinds.get("best", {})}
+
 
 @torch.inference_mode()
 def measure_copy(data: ValidationSet, networks: Networks | None, tick: Tick) -> Statistics:

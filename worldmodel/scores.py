@@ -100,23 +100,54 @@ def score_clips(statistics: Statistics, episodes: NDArray[np.int64], seed: int =
         with each frame's value where the frames were measured one by one; `intervals` with the 95 % bootstrap interval
         over episodes (percentiles of 1000 resamples), None where there is but one episode.
     """
-    draws = _resamples(episodes, seed)
+    once, draws = _once(episodes), _resamples(episodes, seed)
     result: dict[str, Any] = {}
     curves: dict[str, Any] = {}
     intervals: dict[str, Any] = {}
     for score in SCORES:
         result[score.name] = intervals[score.name] = None
-        if any(name not in statistics for name in score.needs):
+        if not defined(score, statistics):
             continue
-        curve = score.formula(_means(statistics, torch.ones((1, len(episodes)), dtype=torch.float64)))[0]
+        curve = score.formula(_means(statistics, once))[0]
         result[score.name] = number(float(curve.mean()))
         if len(curve) > 1 or score.name in PICTURE_SCORES:
             curves[score.name] = [number(value) for value in curve.tolist()]
         if draws is not None:
-            values = score.formula(_means(statistics, draws)).mean(1).numpy()
-            ends = np.nanquantile(values, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2]) if np.isfinite(values).any() else ()
-            intervals[score.name] = [number(float(end)) for end in ends] or None
+            intervals[score.name] = _interval(score.formula(_means(statistics, draws)).mean(1))
     return result | {"curves": curves, "intervals": intervals}
+
+
+def compare_clips(
+    ours: Statistics, theirs: Statistics, episodes: NDArray[np.int64], seed: int = 0
+) -> dict[str, dict[str, Any]]:
+    """How far one row is from another on the same clips.
+
+    Both are resampled together, so that what makes a clip hard for both cancels out.
+
+    Args:
+        ours, theirs: of the same clips.
+        episodes, seed: see `score_clips`.
+
+    Returns:
+        For each score that both have: `difference`, ours less theirs, and its 95 % `interval`.
+    """
+    once, draws = _once(episodes), _resamples(episodes, seed)
+    result = {}
+    for score in SCORES:
+        if not (defined(score, ours) and defined(score, theirs)):
+            continue
+
+        def difference(weights: Tensor, score: Score = score) -> Tensor:
+            return (score.formula(_means(ours, weights)) - score.formula(_means(theirs, weights))).mean(1)
+
+        interval = None if draws is None else _interval(difference(draws))
+        result[score.name] = {"difference": number(float(difference(once))), "interval": interval}
+    return result
+
+
+def defined(score: Score, statistics: Statistics) -> bool:
+    """Whether all that a score is made of was measured."""
+    return all(name in statistics for name in score.needs)
 
 
 def number(value: float) -> float | None:
@@ -127,6 +158,18 @@ def number(value: float) -> float | None:
 def join(parts: Sequence[Statistics]) -> Statistics:
     """Statistics of batches of clips as those of all clips."""
     return {name: torch.cat([part[name].double().cpu() for part in parts]) for name in parts[0]} if parts else {}
+
+
+def _interval(values: Tensor) -> list[float] | None:
+    """Of resampled values; resamples in which a score is not defined do not count."""
+    finite = values[torch.isfinite(values)].numpy()
+    if not len(finite):
+        return None
+    return [float(end) for end in np.quantile(finite, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2])]
+
+
+def _once(episodes: NDArray[np.int64]) -> Tensor:
+    return torch.ones((1, len(episodes)), dtype=torch.float64)
 
 
 def _means(statistics: Statistics, weights: Tensor) -> Means:

@@ -53,10 +53,13 @@ def test_a_model_whose_transforms_do_nothing_scores_as_copying(evaluate, model_f
     assert copy["false_flow_m"] == copy["disocclusion_f1"] == copy["inpainted"] == copy["motion_ari"] == 0
     assert len(moving["curves"]["psnr"]) == 2 and moving["psnr"] == pytest.approx(sum(moving["curves"]["psnr"]) / 2)
     low, high = moving["intervals"]["psnr"]
+    less = moving["less"]["copy"]["psnr"]
+    assert less["difference"] == pytest.approx(moving["psnr"] - copy["psnr"]) and len(less["interval"]) == 2
     assert low <= moving["psnr"] <= high and moving["prediction"] == "latents at 0" and moving["latents"] is None
     report = capsys.readouterr().out
     assert f"| {model_folder}, latents at 0 | {moving['psnr']:.2f}" in report and "| copy |" in report
     assert f"| {model_folder}, without motion |" in report and "Motion against the simulator" in report
+    assert f"| {model_folder} less copy | {less['difference']:+.2f} [" in report
 
 
 def test_best_of_samples_beside_latents_at_0_and_the_posterior(evaluate, make_model, tmp_path, capsys):

@@ -7,7 +7,7 @@ from torchmetrics.functional.clustering import adjusted_rand_score
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
 from worldmodel.metrics import adjusted_rand_index, relative_depth_error, squared_error, ssim
-from worldmodel.scores import score_clips
+from worldmodel.scores import compare_clips, score_clips
 
 EPISODES = np.array([0, 0, 1, 1, 2, 3])
 
@@ -53,6 +53,18 @@ def test_intervals_come_from_resampling_episodes():
     assert low < mean < high and high - low == pytest.approx(2 * 1.96 * standard_error, rel=0.15)
     assert interval([0.5, 0.5, 0.5], [0, 1, 2]) == (0.5, [0.5, 0.5])
     assert interval([0.1, 0.9], [4, 4]) == (0.5, None)
+
+
+def test_differences_are_resampled_together():
+    rng = np.random.default_rng(0)
+    episodes, hard = np.arange(40), rng.normal(0.5, 0.2, 40)
+    ours, theirs = ({"ssim": torch.from_numpy(hard + shift)[:, None]} for shift in (0.03, rng.normal(0, 0.01, 40)))
+    result = compare_clips(ours, theirs, episodes)
+    assert list(result) == ["ssim"]
+    low, high = result["ssim"]["interval"]
+    assert 0.02 < low < result["ssim"]["difference"] < high < 0.04
+    apart = score_clips(ours, episodes)["intervals"]["ssim"]
+    assert apart[0] < score_clips(theirs, episodes)["ssim"] < apart[1]  # which alone would not tell them apart
 
 
 @pytest.mark.parametrize("parts", [(1, 2), (2, 2), (3, 5), (4, 1)])
