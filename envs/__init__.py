@@ -21,3 +21,7 @@ PLANAR_PUSH_STEPS = 60  # 5 s at 12 Hz
 gymnasium.register(
     id="t3vip/PlanarPush-v0", entry_point="envs.planar_push:PlanarPushEnv", max_episode_steps=PLANAR_PUSH_STEPS
 )
+
+DEXHAND_STEPS = 100  # 4 s at 25 Hz
+
+gymnasium.register(id="t3vip/DexHand-v0", entry_point="envs.dexhand:DexHandEnv", max_episode_steps=DEXHAND_STEPS)

@@ -78,11 +78,19 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def decimate(mesh: Mesh, max_faces: int) -> Mesh:
-    """Collapse edges of least quadric error until at most `max_faces` triangles are left."""
+    """Collapse edges of least quadric error until at most `max_faces` triangles are left.
+
+    Raises:
+        UsageError: the mesh has so many loose parts that this is not to be had.
+    """
     vertices, faces, budget = mesh.vertices, mesh.faces, max_faces
     while len(faces) > max_faces:  # the simplifier treats the count as a wish
         vertices, faces = fast_simplification.simplify(vertices, faces, target_count=budget, agg=7.0)
         budget = int(budget * 0.8)
+        if budget < 4 and len(faces) > max_faces:
+            raise UsageError(
+                f"the mesh cannot be made lighter than {len(faces)} triangles; allow it more than {max_faces}"
+            )
     used, faces = np.unique(faces, return_inverse=True)
     return Mesh(vertices[used].astype(np.float32), faces.reshape(-1, 3).astype(np.int32))
 
