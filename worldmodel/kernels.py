@@ -103,7 +103,7 @@ class KernelModel(WorldModel):
         return KernelHeads(logits, generated, self.kernel_head(embedding, action)), [*seen, *states]
 
     def render(
-        self, rgb: Tensor, depth: Tensor, heads: KernelHeads, first: Tensor | None, still: bool
+        self, rgb: Tensor, depth: Tensor, heads: KernelHeads, first: Tensor | None, still: bool, picture: bool = True
     ) -> KernelPrediction:
         """Blend the sources by their masks; `still` makes every kernel a copy."""
         kernels = heads.kernels
@@ -111,6 +111,8 @@ class KernelModel(WorldModel):
             kernels = torch.zeros_like(kernels)
             kernels[..., kernels.shape[-2] // 2, kernels.shape[-1] // 2] = 1
         masks = torch.softmax(heads.logits.float(), dim=1)
+        if not picture:
+            return KernelPrediction(rgb, masks, None, kernels)
         now, moving, generated = masks[:, :1], masks[:, 1 : 1 + self.kernel_count], masks[:, 1 + self.kernel_count :]
         blend = now * rgb + generated[:, :1] * torch.sigmoid(heads.generated.float())
         blend = blend + advect(rgb, moving, kernels)

@@ -121,7 +121,9 @@ class T3VIP(WorldModel):
         rotation, translation = self.transforms(embedding, action)
         return Heads(logits, painted, rotation, translation), [*seen, *mask_states, *paint_states]
 
-    def render(self, rgb: Tensor, depth: Tensor, heads: Heads, first: Tensor | None, still: bool) -> CloudPrediction:
+    def render(
+        self, rgb: Tensor, depth: Tensor, heads: Heads, first: Tensor | None, still: bool, picture: bool = True
+    ) -> CloudPrediction:
         """Transformation layer, splatting layer and RGB-D generator: Eqs. (1) to (5) of the paper."""
         rotation, translation = heads.rotation, heads.translation
         if still:
@@ -134,6 +136,10 @@ class T3VIP(WorldModel):
         transform = geometry.blend_transforms(masks, torch.cat((background, moving), dim=1))
         moved = geometry.apply_transforms(transform, points)
         pixels = geometry.project(moved, self.intrinsics)
+        flows = {"points": points, "transform": transform, "scene_flow": moved - points}
+        flows["optical_flow"] = pixels - self.grid
+        if not picture:
+            return CloudPrediction(rgb=rgb, depth=depth, masks=masks, occlusion=torch.zeros_like(depth), **flows)
         moved_depth = moved[:, 2:]
         warped, coverage = splat(
             torch.cat((rgb, moved_depth), dim=1), pixels, moved_depth, self.config.splat, self.config.splat_sharpness
@@ -149,9 +155,6 @@ class T3VIP(WorldModel):
             rgb=warped[:, :3] * (1 - occlusion) + painted_rgb * occlusion,
             depth=warped[:, 3:].clamp(near, far) * (1 - occlusion) + painted_depth * occlusion,
             masks=masks,
-            points=points,
-            transform=transform,
-            scene_flow=moved - points,
-            optical_flow=pixels - self.grid,
             occlusion=occlusion,
+            **flows,
         )

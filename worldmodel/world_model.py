@@ -136,7 +136,12 @@ class WorldModel(nn.Module, ABC):
         return WorldState(rgb[:, -1].float(), depth[:, -1].float(), memory)
 
     def step(
-        self, state: WorldState, action: Tensor | None, latent: Tensor | None = None, paint: bool = True
+        self,
+        state: WorldState,
+        action: Tensor | None,
+        latent: Tensor | None = None,
+        paint: bool = True,
+        picture: bool = True,
     ) -> tuple[WorldState, Prediction]:
         """Go one frame onward.
 
@@ -144,9 +149,11 @@ class WorldModel(nn.Module, ABC):
             state: of a batch of B, or of 1 from which all actions start.
             action: (B, A) in the dataset's units.
             latent: (B, Z, H/8, W/8), zeros when None.
-            paint: see `predict`.
+            paint, picture: see `predict`.
         """
-        prediction, memory = self.predict(state.rgb, state.depth, action, latent, state.memory, paint=paint)
+        prediction, memory = self.predict(
+            state.rgb, state.depth, action, latent, state.memory, paint=paint, picture=picture
+        )
         depth = state.depth if prediction.depth is None else prediction.depth
         return WorldState(prediction.rgb, depth, memory), prediction
 
@@ -159,6 +166,7 @@ class WorldModel(nn.Module, ABC):
         memory: Memory,
         still: bool = False,
         paint: bool = True,
+        picture: bool = True,
     ) -> tuple[Prediction, Memory]:
         """One frame, one action and a latent to the next frame.
 
@@ -171,6 +179,8 @@ class WorldModel(nn.Module, ABC):
             still: let nothing move (identity transforms, kernels that copy), to see what is left without motion.
             paint: paint what was hidden before. Without it disoccluded pixels keep what was there; a third less work
                 for T3VIP, for planners that look a few frames ahead.
+            picture: make the next frame. Without it RGB and depth stay as they were and masks and motions are all that
+                is predicted, which is what a planner needs of the last step that it looks ahead.
 
         Returns:
             The prediction and the new memory.
@@ -191,7 +201,7 @@ class WorldModel(nn.Module, ABC):
             rgb, depth, memory = expand(rgb, batch), expand(depth, batch), Memory([], memory.first)
             memory = memory.expand(batch)
         with torch.autocast(device, enabled=False):
-            prediction = self.render(rgb.float(), depth.float(), heads, memory.first, still)
+            prediction = self.render(rgb.float(), depth.float(), heads, memory.first, still, picture)
         return prediction, Memory(states, memory.first)
 
     def frame(self, rgb: Tensor, depth: Tensor) -> Tensor:
@@ -223,7 +233,9 @@ class WorldModel(nn.Module, ABC):
         """All that is learned: scaled frame, normalised action and latent to what `render` needs, and new states."""
 
     @abstractmethod
-    def render(self, rgb: Tensor, depth: Tensor, heads: Any, first: Tensor | None, still: bool) -> Prediction:
+    def render(
+        self, rgb: Tensor, depth: Tensor, heads: Any, first: Tensor | None, still: bool, picture: bool = True
+    ) -> Prediction:
         """The next frame, in float32, from the current one and the network's output."""
 
     def blank_memory(self, like: Tensor) -> Memory:

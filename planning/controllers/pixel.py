@@ -49,7 +49,8 @@ class PixelController(LearnedController):
             future, track = state, start
             distances = []
             for step in range(actions.shape[1]):
-                future, prediction = self.model.step(future, actions[:, step], paint=False)
+                last = step + 1 == actions.shape[1]  # nobody looks at its picture
+                future, prediction = self.model.step(future, actions[:, step], paint=False, picture=not last)
                 track = track.advance(prediction)
                 distances.append(track.expected_distance(target))
             return discounted_distance(torch.stack(distances, dim=1).cpu().numpy())

@@ -57,7 +57,7 @@ class ExactModel:
         assert rgb.dtype == depth.dtype == actions.dtype == torch.float32
         return None  # one past for all futures
 
-    def step(self, state, action, latent=None, paint=True):
+    def step(self, state, action, latent=None, paint=True, picture=True):
         self.asked.append(action)
         count = len(action)
         assert action.shape == (count, self.action_dim) and state in (None, count)

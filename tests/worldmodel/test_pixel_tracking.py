@@ -102,3 +102,18 @@ def test_mass_leaves_the_picture_but_none_comes_in():
     track = start.advance(prediction([(3, 3), (-4, 0)]))
     torch.testing.assert_close(track.distribution[0], one_hot(3, 3))
     torch.testing.assert_close(track.distribution[1], 0.5 * one_hot(SIZE - 5, 0) + 0.5 * one_hot(SIZE - 5, SIZE - 1))
+
+
+@pytest.mark.parametrize("kind", ["t3vip", "sv2p"])
+def test_motion_is_the_same_without_a_picture(kind, make_model, camera_of):
+    context = make_model(camera_of(SIZE, SIZE)).context
+    model = KINDS[kind](ModelConfig(width=0.25, masks=4), context).eval()
+    rgb, depth = torch.rand(1, 2, 3, SIZE, SIZE), torch.full((1, 2, 1, SIZE, SIZE), 2.0)
+    actions = torch.randn(3, 7)
+    with torch.inference_mode():
+        state = model.observe(rgb, depth, torch.randn(1, 1, 7))
+        _, full = model.step(state, actions, paint=False)
+        _, bare = model.step(state, actions, paint=False, picture=False)
+    assert not torch.equal(full.rgb, bare.rgb)
+    for name in ("masks", "transform", "optical_flow") if kind == "t3vip" else ("masks", "kernels"):
+        torch.testing.assert_close(getattr(full, name), getattr(bare, name))
