@@ -54,11 +54,15 @@ def collect_episode(
         obs, reward, terminated, _, info = env.step(action)
         rows["action"].append(action)
         rows["reward"].append(reward)
+        if "joint_delta" in info:
+            rows["joint_delta"].append(info["joint_delta"])
         _record(rows, env, obs, info, ground_truth)
         if terminated:
             break
     rows["action"].append(np.zeros(space.shape))
     rows["reward"].append(0.0)
+    if "joint_delta" in rows:
+        rows["joint_delta"].append(np.zeros_like(rows["joint_delta"][-1]))
     rows["depth"] = [quantise_depth(frame, camera.near, camera.far) for frame in rows["depth"]]
     return {name: np.stack(rows[name]).astype(COLUMNS[name].dtype) for name in COLUMNS if name in rows}
 

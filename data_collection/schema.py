@@ -8,6 +8,7 @@ shard-00007.h5
   state        (N, S)          float64  the simulator's full state
   reward       (N,)            float32  row t: earned by action t; zero in an episode's last row
   scene_obs    (N, O)          float32  optional: what the fixtures and objects do
+  joint_delta  (N, J)          float32  optional: row t: how far each joint went by action t, rad; zeros in the last row
   segmentation (N, H, W)       uint8    optional: body ids, 0 = background
   body_pose    (N, nbody, 7)   float32  optional: world position, unit quaternion wxyz
   ep_len       (E,)            int64    rows of each episode: its actions + 1
@@ -54,6 +55,7 @@ COLUMNS: dict[str, Column] = {
     "state": Column("float64", 2),
     "reward": Column("float32", 1),
     "scene_obs": Column("float32", 2, required=False),
+    "joint_delta": Column("float32", 2, required=False),
     "segmentation": Column("uint8", 3, required=False),
     "body_pose": Column("float32", 3, required=False),
 }

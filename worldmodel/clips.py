@@ -15,6 +15,9 @@ from data_collection.dataset import RGBDDataset
 from envs import ground_truth
 from envs.errors import UsageError
 
+ACTION_COLUMNS = ("action", "joint_delta")
+"""What a model may be conditioned on: what was commanded, or how far each joint went, which tells of the outcome."""
+
 
 @dataclass(frozen=True)
 class Clips:
@@ -54,18 +57,33 @@ class ClipSource:
         frame_gap: control steps from one frame of a clip to the next.
         episodes: which episodes to use; all when None.
         share: another source of the same dataset, whose memory this one uses too.
+        action_column: one of `ACTION_COLUMNS`.
     """
 
     def __init__(
-        self, dataset: RGBDDataset, frame_gap: int, episodes: slice | None = None, share: ClipSource | None = None
+        self,
+        dataset: RGBDDataset,
+        frame_gap: int,
+        episodes: slice | None = None,
+        share: ClipSource | None = None,
+        action_column: str = "action",
     ) -> None:
         if frame_gap < 1:
             raise UsageError(f"frame-gap is {frame_gap}; give 1 for adjacent frames, or more")
-        self.dataset, self.frame_gap = dataset, frame_gap
+        if action_column not in ACTION_COLUMNS:
+            raise UsageError(f"action-column is {action_column!r}; choose one of {', '.join(ACTION_COLUMNS)}")
+        self.dataset, self.frame_gap, self.action_column = dataset, frame_gap, action_column
         self._slices = dataset.episode_slices[episodes or slice(None)]
-        self._columns: dict[str, NDArray[Any]] = (
-            share._columns if share else {name: dataset.load(name) for name in ("rgb", "depth", "action")}
-        )
+        self._columns: dict[str, NDArray[Any]] = share._columns if share else {}
+        for name in ("rgb", "depth", action_column):
+            if name not in self._columns:
+                self._columns[name] = dataset.load(name)
+        self.action_dim = int(self._columns[action_column].shape[1])
+        self.action_aggregation: tuple[str, ...] = ("sum",) * self.action_dim  # of joint deltas, in radians
+        self.action_scale: tuple[float, ...] = (1.0,) * self.action_dim
+        if action_column == "action":
+            self.action_aggregation = tuple(dataset.attrs["action_aggregation"])
+            self.action_scale = tuple(float(unit) for unit in dataset.attrs["action_scale"])
 
     def starts(self, frames: int) -> NDArray[np.int64]:
         """First rows of all clips of `frames` frames."""
@@ -98,9 +116,16 @@ class ClipSource:
     def actions_at(self, starts: NDArray[np.int64], frames: int) -> NDArray[np.float32]:
         """(B, frames-1, A) aggregated actions of the clips that start at these rows."""
         rows = self._rows(starts, frames)[:, :-1, None] + np.arange(self.frame_gap)
-        attrs = self.dataset.attrs
-        actions = aggregate_actions(self._columns["action"][rows], attrs["action_aggregation"], attrs["action_scale"])
-        return actions.astype(np.float32)
+        actions = self._columns[self.action_column][rows]
+        return aggregate_actions(actions, self.action_aggregation, self.action_scale).astype(np.float32)
+
+    def with_actions(self, action_column: str) -> ClipSource:
+        """The same clips with another action column; shares the memory."""
+        if action_column == self.action_column:
+            return self
+        other = ClipSource(self.dataset, self.frame_gap, share=self, action_column=action_column)
+        other._slices = self._slices
+        return other
 
     def truth_at(self, starts: NDArray[np.int64], frames: int) -> ClipTruth:
         """Scene flow, hand pixels and TCP of the clips that start at these rows; needs a dataset with ground truth."""

@@ -69,3 +69,5 @@ class ModelContext:
     action_mean: tuple[float, ...]
     action_std: tuple[float, ...]
     """Statistics of aggregated training actions, for normalisation inside the model."""
+    action_column: str = "action"
+    """The column of a dataset that the model takes as its actions."""

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from data_collection.dataset import RGBDDataset
@@ -18,12 +16,13 @@ from worldmodel import evaluation_report as report
 from worldmodel.checkpoint import load_inference, load_model
 from worldmodel.clips import ClipSource
 from worldmodel.devices import best_precision, find_device
-from worldmodel.measurement import Measured, Networks, Sampling, measure_copy, measure_model
+from worldmodel.evaluation_table import EvaluationTable
+from worldmodel.measurement import Networks, Sampling, measure_copy, measure_model
 from worldmodel.memory import keep_freed_memory
 from worldmodel.perceptual import SMALLEST, PerceptualNetwork
 from worldmodel.perceptual_weights import WeightsUnavailable, load_weights
 from worldmodel.sampling import Selection
-from worldmodel.scores import RESAMPLES, Statistics, compare_clips, score_clips
+from worldmodel.scores import RESAMPLES
 from worldmodel.validation import ValidationSet
 from worldmodel.world_model import WorldModel
 
@@ -87,37 +86,26 @@ def main(options: EvaluationOptions) -> None:
     models = {name: load_model(name, options.device) for name in options.models}
     for name, model in models.items():
         _check(name, model, dataset, options)
-    gaps = sorted({options.frame_gap or model.frame_gap for model in models.values()})
-    sets = _clip_sets(dataset, gaps, options)
+    gaps = {name: options.frame_gap or model.frame_gap for name, model in models.items()}
+    sets = _clip_sets(dataset, sorted(set(gaps.values())), options)
     options.out.mkdir(parents=True, exist_ok=True)
     networks, notes = _networks(options, dataset)
     select: Selection = options.select if networks is not None else "psnr"
     sampling = Sampling(options.samples, select, options.seed) if options.samples else None
-    copies: dict[str, Any] = {}
-    entries: dict[str, Any] = {}
-    headline: dict[int, dict[str, Statistics]] = {gap: {} for gap in gaps}  # what each row's scores are made of
-    with tqdm(total=sum(len(_starts(sets[g])) for g in gaps), unit="clip", dynamic_ncols=True) as bar:
-        bar.total += sum(len(_starts(sets[options.frame_gap or model.frame_gap])) for model in models.values())
-        for gap in gaps:
-            name = "copy" if len(gaps) == 1 else f"copy at gap {gap}"
-            bar.set_description(name)
-            copied = measure_copy(sets[gap], networks, bar.update)
-            copies[name] = {"frame_gap": gap, "prediction": name} | _scored(copied, sets[gap], options)
-            headline[gap][name] = copied
+    table = EvaluationTable(sets, sampling, options.seed)
+    document = _document(options, dataset, sets, select, notes)
+    with tqdm(total=sum(map(_count, [*sets.values(), *(sets[gap] for gap in gaps.values())])), unit="clip") as bar:
+        for gap, data in sets.items():
+            bar.set_description("copy")
+            table.add_copy(gap, measure_copy(data, networks, bar.update))
         for name, model in models.items():
             bar.set_description(name)
-            gap = options.frame_gap or model.frame_gap
-            data = sets[gap]
-            inference = load_inference(name, model)
+            data, inference = sets[gaps[name]], load_inference(name, model)
+            data = replace(data, source=data.source.with_actions(model.context.action_column))
             measured = measure_model(model, data, networks, sampling, inference, options.without_motion, bar.update)
-            entries[name] = _entry(measured, data, options, sampling, bool(model.latent_channels))
-            entries[name]["less"] = {
-                other: compare_clips(measured.headline, statistics, _episodes(data), options.seed)
-                for other, statistics in headline[gap].items()
-            }
-            headline[gap][name] = measured.headline
-            bar.write(report.line(name, entries[name]))
-            document = _document(options, dataset, sets, select, notes, {**entries, **copies})
+            entry = table.add_model(name, gaps[name], measured, stochastic=bool(model.latent_channels))
+            bar.write(report.line(name, entry))
+            document["models"] = table.entries
             _write(options.out, document)
     print(f"\n{report.markdown(document)}")
     for file in ("evaluation.json", "evaluation.md", "curves.png"):
@@ -130,7 +118,7 @@ def _check(name: str, model: WorldModel, dataset: RGBDDataset, options: Evaluati
             f"{name} wants pictures of {model.camera.height}x{model.camera.width}, {options.data} has "
             f"{dataset.camera.height}x{dataset.camera.width}; collect with another --image-size"
         )
-    if model.context.action_dim != dataset.action_dim:
+    if model.context.action_column == "action" and model.context.action_dim != dataset.action_dim:
         raise UsageError(
             f"{name} takes actions of {model.context.action_dim} numbers, {options.data} has {dataset.action_dim}; "
             "evaluate on data of the environment it was trained in"
@@ -144,12 +132,12 @@ def _clip_sets(dataset: RGBDDataset, gaps: list[int], options: EvaluationOptions
     for gap in gaps:
         source = ClipSource(dataset, gap, share=sets[gaps[0]].source if sets else None)
         sets[gap] = ValidationSet(source, options.clips, frames, options.context, options.batch)
-        _starts(sets[gap])  # now, not after the first model: are the episodes long enough?
+        _count(sets[gap])  # now, not after the first model: are the episodes long enough?
     return sets
 
 
-def _starts(data: ValidationSet) -> NDArray[np.int64]:
-    return data.source.spread(data.clips, data.frames)
+def _count(data: ValidationSet) -> int:
+    return len(data.source.spread(data.clips, data.frames))
 
 
 def _networks(options: EvaluationOptions, dataset: RGBDDataset) -> tuple[Networks | None, list[str]]:
@@ -174,54 +162,17 @@ def _networks(options: EvaluationOptions, dataset: RGBDDataset) -> tuple[Network
     return None, [reason]
 
 
-def _scored(statistics: Statistics, data: ValidationSet, options: EvaluationOptions) -> dict[str, Any]:
-    return score_clips(statistics, _episodes(data), options.seed)
-
-
-def _episodes(data: ValidationSet) -> NDArray[np.int64]:
-    """The episode that each clip is from."""
-    return np.searchsorted(data.source.dataset.episode_slices[:, 1], _starts(data), side="right")
-
-
-def _entry(
-    measured: Measured, data: ValidationSet, options: EvaluationOptions, sampling: Sampling | None, stochastic: bool
-) -> dict[str, Any]:
-    """One model's entry: the best sample's scores where there are samples; motion is that of latents at 0."""
-    kinds = measured.kinds
-    scored = {kind: _scored(statistics, data, options) for kind, statistics in kinds.items()}
-    prediction = "latents at 0" if stochastic else "deterministic"
-    entry = scored["zero"]
-    if "best" in kinds:
-        assert sampling is not None
-        prediction = f"best of {sampling.samples} by {sampling.select.upper()}"
-        entry = _scored(measured.headline, data, options)
-    entry = {"frame_gap": data.source.frame_gap, "prediction": prediction, **entry}
-    if "best" in kinds:
-        entry["latents_zero"] = scored["zero"]
-    if "still" in kinds:
-        entry["without_motion"] = scored["still"]
-    if "posterior" in kinds:
-        assert measured.latents is not None
-        entry["posterior"] = scored["posterior"]
-        gap = scored["posterior"]["psnr"] - scored["zero"]["psnr"]
-        entry["latents"] = {**measured.latents, "psnr_gap": gap}
-    else:
-        entry["latents"] = None
-    return entry
-
-
 def _document(
     options: EvaluationOptions,
     dataset: RGBDDataset,
     sets: dict[int, ValidationSet],
     select: Selection,
     notes: list[str],
-    models: dict[str, Any],
 ) -> dict[str, Any]:
     return {
         "data": {"path": str(options.data), "env_id": dataset.attrs["env_id"], "hash": dataset.content_hash},
         "protocol": {
-            "clips": max(len(_starts(data)) for data in sets.values()),
+            "clips": max(map(_count, sets.values())),
             "context": options.context,
             "predicted": options.predicted,
             "samples": options.samples,
@@ -230,7 +181,7 @@ def _document(
             "resamples": RESAMPLES,
             "notes": notes,
         },
-        "models": models,
+        "models": {},
     }
 
 

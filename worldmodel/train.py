@@ -78,15 +78,19 @@ def _open(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
     if options.validation is not None:
         held_out = RGBDDataset(options.validation)
         _same_world(dataset, held_out)
-        train, other = ClipSource(dataset, options.frame_gap), ClipSource(held_out, options.frame_gap)
+        train, other = (
+            ClipSource(opened, options.frame_gap, action_column=options.action_column) for opened in (dataset, held_out)
+        )
     else:
         if dataset.episodes < 2:
             raise UsageError(
                 f"{dataset.path} has {dataset.episodes} episode, none to hold out; collect more, or give --validation"
             )
         split = dataset.episodes - max(1, dataset.episodes // HELD_OUT)
-        train = ClipSource(dataset, options.frame_gap, slice(0, split))
-        other = ClipSource(dataset, options.frame_gap, slice(split, None), share=train)
+        train = ClipSource(dataset, options.frame_gap, slice(0, split), action_column=options.action_column)
+        other = ClipSource(
+            dataset, options.frame_gap, slice(split, None), share=train, action_column=options.action_column
+        )
     frames = max(frames for _, frames in options.schedule.clip_lengths)
     for clips in (train, other):
         clips.starts(frames)  # now, not hours later, when the curriculum gets there
@@ -109,13 +113,14 @@ def _context(train: ClipSource, options: TrainOptions) -> ModelContext:
     return ModelContext(
         env_id=attrs["env_id"],
         camera=train.dataset.camera.to_json(),
-        action_dim=train.dataset.action_dim,
+        action_dim=train.action_dim,
         frame_gap=options.frame_gap,
         control_rate=float(attrs["control_rate"]),
-        action_aggregation=tuple(attrs["action_aggregation"]),
-        action_scale=tuple(float(x) for x in attrs["action_scale"]),
+        action_aggregation=train.action_aggregation,
+        action_scale=train.action_scale,
         action_mean=tuple(float(x) for x in mean),
         action_std=tuple(float(x) for x in std),
+        action_column=train.action_column,
     )
 
 
@@ -138,7 +143,7 @@ def existing_run(options: TrainOptions) -> TrainOptions | None:
     if not path.exists():
         return None
     try:
-        before = dict(json.loads(path.read_text()))
+        before = {"action_column": "action", **json.loads(path.read_text())}  # older runs do not say
         if options.minutes is not None:  # then the number of steps is the run's own
             options = replace(options, steps=int(before["steps"]))
     except (ValueError, TypeError, KeyError) as error:

@@ -106,7 +106,15 @@ def main(options: ViewOptions) -> None:
     names = labels(options.models)
     seed = options.seed or 0
     shown = [
-        predict(names[name], model, clips, options.context, options.samples, seed) for name, model in models.items()
+        predict(
+            names[name],
+            model,
+            source.with_actions(model.context.action_column).at(rows, frames),
+            options.context,
+            options.samples,
+            seed,
+        )
+        for name, model in models.items()
     ]
     board = storyboard(clips, truth, options.context, shown)
     scene = Scene(dataset.camera, clips, truth, options.context, board.frame_seconds, shown)
@@ -180,8 +188,9 @@ def _liveliest(rgb: NDArray[np.uint8], span: int) -> int:
 
 def _check_fits(dataset: RGBDDataset, models: dict[str, WorldModel], options: ViewOptions) -> None:
     for name, model in models.items():
+        commanded = model.context.action_column == "action"
         for what, ours, theirs in (
-            ("action size", model.context.action_dim, dataset.action_dim),
+            ("action size", model.context.action_dim, dataset.action_dim if commanded else model.context.action_dim),
             ("image size", (model.camera.height, model.camera.width), (dataset.camera.height, dataset.camera.width)),
         ):
             if ours != theirs:

@@ -134,6 +134,24 @@ def test_statistics_of_aggregated_actions(source, tmp_path, write_dataset):
     assert mean[6] == 1 and std[6] == 1  # never divides by zero
 
 
+def test_joint_deltas_in_place_of_commands(tmp_path, write_dataset):
+    folder = write_dataset(tmp_path, [12, 12])
+    dataset = RGBDDataset(folder)
+    with pytest.raises(UsageError, match="no column 'joint_delta'"):
+        ClipSource(dataset, GAP, action_column="joint_delta")
+    deltas = np.random.default_rng(0).normal(size=(12, 5)).astype(np.float32)
+    for shard in folder.glob("*.h5"):
+        with h5py.File(shard, "r+") as file:
+            file["joint_delta"] = np.tile(deltas, (len(file["action"]) // 12, 1))
+    commanded = ClipSource(RGBDDataset(folder), GAP)
+    moved = commanded.with_actions("joint_delta")
+    clips = moved.at(np.array([12]), 3)
+    np.testing.assert_allclose(clips.actions[0, 1], deltas[3:6].sum(0), atol=1e-5)
+    assert torch.equal(clips.rgb, commanded.at(np.array([12]), 3).rgb)
+    assert moved.action_dim == 5 and commanded.action_dim == 7
+    assert moved.with_actions("joint_delta") is moved
+
+
 def test_colour_jitter_changes_colours_only_and_whole_clips_alike(source, starts):
     clips = source.at(starts[:4], 2)
     still = torch.stack((clips.rgb[:, 0],) * 2, dim=1)
