@@ -287,7 +287,7 @@ class DexHandEnv(gymnasium.Env):
         return self._cameras[name, size]
 
     def _draw_goal(self) -> None:
-        """The next goal follows from the episode's seed and its number, so that a restored state goes on to the same."""
+        """The next goal follows from the episode's seed and its number: a restored state goes on to the same."""
         rng = np.random.default_rng((self._goal_seed, self._goals_reached))
         self._set_goal(goals.draw_goal(self.cube_pose[3:], np.radians(self.goal_angle), rng))
 

@@ -86,6 +86,6 @@ def product(left: ArrayLike, right: ArrayLike) -> Array:
 
 
 def draw_goal(cube_orientation: ArrayLike, max_angle: float, rng: np.random.Generator) -> Array:
-    """A goal pose (7,): the cube's orientation (4,) turned by at most `max_angle` radians, in the middle of the hand."""
+    """A goal pose (7,): the cube's orientation (4,) turned by at most `max_angle` radians, and `HOME`."""
     orientation = product(random_turn(max_angle, rng), cube_orientation)
     return np.concatenate([HOME, orientation / np.linalg.norm(orientation)])

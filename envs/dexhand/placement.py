@@ -15,7 +15,7 @@ from envs.errors import UsageError
 
 POSTURE_SPREAD = 0.12  # standard deviation of each action number about the middle, where the hand is a bowl
 FALL, PLACE_SPREAD = 0.03, 0.004  # m, above where the cube comes to lie; standard deviation in x and y
-SETTLE_STEPS = 15  # control steps, 0.6 s
+SETTLE_STEPS = 25  # control steps, 1 s
 TRIES = 50
 
 Array = NDArray[np.float64]
