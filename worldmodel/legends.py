@@ -68,7 +68,7 @@ def _scene_flow(page: Pillow.Image, draw: ImageDraw.ImageDraw, scales: Scales) -
     width, height = page.size
     bar_width, bar_height, left = int(0.80 * width), max(2, height // 14), int(0.10 * width)
     full = scales.scene_flow
-    for axis, words in enumerate((("left", "right"), ("up", "down"), ("near", "away"))):
+    for axis, words in enumerate((("left", "right"), ("up", "down"), ("closer", "away"))):
         flow = torch.zeros(3, bar_height, bar_width)
         flow[axis] = torch.linspace(-full, full, bar_width)
         top = int((0.05 + 0.27 * axis) * height)

@@ -81,7 +81,7 @@ def write_scene(scene: Scene, path: Path) -> None:
     recording = _rerun().RecordingStream(APPLICATION)
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_aside(path) as aside:
-        recording.save(aside, default_blueprint=_blueprint(scene))
+        recording.save(aside)
         _Recorder(scene, recording).record()
         recording.disconnect()
 
@@ -89,7 +89,7 @@ def write_scene(scene: Scene, path: Path) -> None:
 def view_scene(scene: Scene) -> None:
     """Open the viewer and send the scene there; it stays open."""
     recording = _rerun().RecordingStream(APPLICATION)
-    recording.spawn(default_blueprint=_blueprint(scene))
+    recording.spawn()
     _Recorder(scene, recording).record()
 
 
@@ -101,14 +101,14 @@ def _rerun() -> Any:
 
 
 def _blueprint(scene: Scene) -> Any:
-    """Above the clouds, each on its own and all in one; below, the pictures."""
+    """Above the clouds, each on its own, so that it fills its view, and all in one with the camera; below, pictures."""
     rrb = importlib.import_module("rerun.blueprint")
 
     def view(name: str, *contents: str) -> Any:
         return rrb.Spatial3DView(name=name, origin="world", contents=list(contents), background=[255, 255, 255])
 
     spatial = [shown.name for shown in scene.models if shown.clouds]
-    clouds = [view(name, "world/camera/**", f"{_entity('world', name)}/**") for name in (TRUTH, *spatial)]
+    clouds = [view(name, f"{_entity('world', name)}/**") for name in (TRUTH, *spatial)]
     if spatial:
         clouds.append(view("all in one", "world/**"))
     pictures = [
@@ -133,6 +133,7 @@ class _Recorder:
 
     def record(self) -> None:
         """All of it."""
+        self.recording.send_blueprint(_blueprint(self.scene))
         self._record_camera()
         sources: dict[str, Iterator[tuple[int, _Cloud]]] = {TRUTH: _true_clouds(self.scene)}
         sources |= {shown.name: _predicted_clouds(self.scene, shown) for shown in self.scene.models if shown.clouds}
@@ -173,7 +174,7 @@ class _Recorder:
         camera, depth = self.camera, cloud.depth[0].cpu().numpy()
         points = camera.to_world(camera.unproject(depth))  # (H, W, 3)
         surface = depth < camera.far - 1e-3 * (camera.far - camera.near)  # nobody knows what is beyond the range
-        radii = 0.6 * depth[surface] / camera.K[0, 0]  # neighbours just touch
+        radii = 0.7 * depth[surface] / camera.K[0, 0]  # neighbours just touch
         self._log(
             f"{path}/points", self.rr.Points3D(points[surface], colors=rgb_colours(cloud.rgb)[surface], radii=radii)
         )
