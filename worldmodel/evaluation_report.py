@@ -15,6 +15,7 @@ Entry = Mapping[str, Any]
 Rows = list[tuple[str, Entry]]
 VARIANTS = (("latents_zero", "latents at 0"), ("posterior", "posterior mean"), ("without_motion", "without motion"))
 """Entries within a model's entry that get a row of their own."""
+DRAWN = tuple(score for score in SCORES if score.name in PICTURE_SCORES and score.name != "inpainted")
 ARROWS = {"higher": "↑", "lower": "↓"}
 
 
@@ -74,13 +75,16 @@ def _table(rows: Rows, scores: Sequence[Score]) -> list[str]:
 
 
 def _comparisons(models: Mapping[str, Entry]) -> list[str]:
-    """Each model less those above it in the table and less copying."""
+    """Each model less copying and less those below it in the table."""
     pairs = [(f"{name} less {other}", gap) for name, e in models.items() for other, gap in e.get("less", {}).items()]
     shown = [s for s in SCORES if s.name in PICTURE_SCORES and any(s.name in gap for _, gap in pairs)]
     lines = ["| | " + " | ".join(f"{score.title} {ARROWS[score.better]}" for score in shown) + " |"]
     lines.append("|---" * (len(shown) + 1) + "|")
     for title, gap in pairs:
-        cells = [_value(*gap[s.name].values(), s.digits, "+") if s.name in gap else "–" for s in shown]
+        cells = []
+        for score in shown:
+            one = gap.get(score.name, {})
+            cells.append(_value(one.get("difference"), one.get("interval"), score.digits, "+"))
         lines.append("| " + " | ".join([title, *cells]) + " |")
     return lines if shown else []
 
@@ -94,9 +98,8 @@ def _value(value: float | None, interval: Sequence[float] | None, digits: int, s
     if value is None:
         return "–"
     text = f"{value:{sign}.{digits}f}"
-    if interval and interval[0] != interval[1]:
-        text += f" [{interval[0]:{sign}.{digits}f}, {interval[1]:{sign}.{digits}f}]"
-    return text
+    ends = [f"{end:{sign}.{digits}f}" for end in interval or ()]
+    return f"{text} [{', '.join(ends)}]" if len(set(ends)) > 1 else text
 
 
 def line(name: str, entry: Entry) -> str:
@@ -110,29 +113,35 @@ def line(name: str, entry: Entry) -> str:
 
 
 def draw_curves(document: Mapping[str, Any], path: Path) -> None:
-    """Scores over the predicted frames, one panel a score, one line a row of the table, as a PNG."""
-    rows = _rows(document["models"])
-    shown = [s for s in SCORES if any(_drawable(entry["curves"].get(s.name)) for _, entry in rows)]
+    """Scores over the predicted frames, one panel a score, as a PNG: models solid, with latents at 0 dotted where the
+    best of many is drawn too, copying dashed."""
+    models = document["models"]
+    shown = [s for s in DRAWN if any(_drawable(entry["curves"].get(s.name)) for entry in models.values())]
     columns = min(3, max(len(shown), 1))
     height = -(-len(shown) // columns)
-    figure = Figure(figsize=(4.2 * columns, 3.1 * height + 0.3 * len(rows)), layout="constrained")
-    axes = figure.subplots(height, columns, squeeze=False).flatten()
-    for panel, score in zip(axes, shown, strict=False):
-        for i, (title, entry) in enumerate(rows):
-            curve = entry["curves"].get(score.name)
-            if _drawable(curve):
-                style = "--" if title.startswith("copy") else "-"
-                panel.plot(range(1, len(curve) + 1), curve, style, color=f"C{i % 10}", label=title, marker=".", ms=3)
+    figure = Figure(figsize=(3.8 * columns, 2.8 * height + 0.4), layout="constrained")
+    panels = figure.subplots(height, columns, squeeze=False).flatten()
+    for panel, score in zip(panels, shown, strict=False):
+        for i, (name, entry) in enumerate(models.items()):
+            colour, style = ("black", "--") if name == entry["prediction"] else (f"C{i % 10}", "-")
+            _draw(panel, entry, score, color=colour, linestyle=style, label=name)
+            _draw(panel, entry.get("latents_zero"), score, color=colour, linestyle=":", label=f"{name}, latents at 0")
         panel.set_title(f"{score.title} {ARROWS[score.better]}", fontsize=9)
+        panel.set_xlabel("predicted frame", fontsize=8)
         panel.tick_params(labelsize=8)
         panel.grid(alpha=0.3)
-        panel.set_xlabel("predicted frame", fontsize=8)
-    for panel in axes[len(shown) :]:
+    for panel in panels[len(shown) :]:
         panel.set_axis_off()
-    labels = {label: handle for panel in axes for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)}
-    figure.legend(labels.values(), labels.keys(), loc="outside lower left", fontsize=8, frameon=False)
+    lines = {line.get_label(): line for panel in panels for line in panel.get_lines()}
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     with written_aside(path) as aside:
         figure.savefig(aside, format="png", dpi=100)
+
+
+def _draw(panel: Any, entry: Entry | None, score: Score, **style: Any) -> None:
+    curve = entry["curves"].get(score.name) if entry else None
+    if _drawable(curve):
+        panel.plot(range(1, len(curve) + 1), curve, marker=".", markersize=3, linewidth=1.2, **style)
 
 
 def _drawable(curve: Sequence[float | None] | None) -> bool:
