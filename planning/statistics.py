@@ -84,9 +84,9 @@ class Pairs:
         spread *= (self.both + self.second) * (self.first + self.neither)
         if spread == 0:
             return 0.0
-        together = self.both * self.neither - self.first * self.second
+        together = float(self.both * self.neither - self.first * self.second)
         if together > 0:
-            together = max(together - self.total / 2, 0)
+            together = max(together - self.total / 2, 0.0)
         return together / math.sqrt(spread)
 
     def p_value(self) -> float:

@@ -90,8 +90,14 @@ def _add_row(out: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
 @compiled
 def _row_of_weights(gradient: Tensor, rows: Tensor, size: int) -> Tensor:
     width = gradient.shape[-1]
-    shifts = [gradient * rows[..., j : j + width] for j in range(size)]
-    return torch.stack([sum(shift.unbind(1)) for shift in shifts], dim=1)
+    columns = []
+    for j in range(size):
+        shift = gradient * rows[..., j : j + width]
+        total = shift[:, 0]
+        for channel in range(1, shift.shape[1]):
+            total = total + shift[:, channel]
+        columns.append(total)
+    return torch.stack(columns, dim=1)
 
 
 @compiled
