@@ -140,7 +140,7 @@ def draw_curves(document: Mapping[str, Any], path: Path) -> None:
 
 def _draw(panel: Any, entry: Entry | None, score: Score, **style: Any) -> None:
     curve = entry["curves"].get(score.name) if entry else None
-    if _drawable(curve):
+    if curve is not None and _drawable(curve):
         panel.plot(range(1, len(curve) + 1), curve, marker=".", markersize=3, linewidth=1.2, **style)
 
 

@@ -51,7 +51,7 @@ class EvaluationTable:
         prediction = "latents at 0" if stochastic else "deterministic"
         if "best" in kinds and self.sampling is not None:
             prediction = f"best of {self.sampling.samples} by {self.sampling.select.upper()}"
-        entry = {"frame_gap": gap, "prediction": prediction} | self._scored(gap, headline)
+        entry: dict[str, Any] = {"frame_gap": gap, "prediction": prediction} | self._scored(gap, headline)
         entry["less"] = {}
         for other, statistics in self._measured[gap].items():
             if other in self._models:
