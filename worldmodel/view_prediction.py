@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -16,11 +16,12 @@ from envs import command as command_line
 from envs.errors import UsageError
 from worldmodel.checkpoint import find_model, load_model
 from worldmodel.clips import ClipSource
-from worldmodel.figure import write_film, write_sheet
+from worldmodel.figure import Storyboard, write_film, write_sheet
 from worldmodel.pictures import predict, storyboard
 from worldmodel.viewer3d import Scene, require_rerun, view_scene, write_scene
 from worldmodel.world_model import WorldModel
 
+Section = Literal["rgb", "depth", "masks", "scene-flow", "optical-flow", "occlusion"]
 TILE = 128
 """Pixels: pictures are enlarged to at least this width."""
 SUFFIXES = (".png", ".mp4", ".rrd")
@@ -54,6 +55,8 @@ class ViewOptions:
     """Frames that they predict from them."""
     samples: int = 0
     """Futures of each model with latents, drawn from the prior and shown under the one with latents at 0."""
+    sections: tuple[Section, ...] = ()
+    """Which kinds of picture the figure and the film show; all that there are when not given."""
     columns: int = 10
     """At most so many predicted frames in the figure, evenly spread; the film shows all of them."""
     scale: int | None = None
@@ -118,6 +121,8 @@ def main(options: ViewOptions) -> None:
     ]
     board = storyboard(clips, truth, options.context, shown)
     scene = Scene(dataset.camera, clips, truth, options.context, board.frame_seconds, shown)
+    if options.sections:
+        board = _only(board, options.sections)
     scale = options.scale or -(-TILE // dataset.camera.width)
     for path in options.out:
         if path.suffix.lower() == ".png":
@@ -132,6 +137,17 @@ def main(options: ViewOptions) -> None:
         f"{', '.join(names.values())}: {options.predicted} predicted frames beside the truth, episode {episode} from "
         f"step {start}{': ' if options.out else ''}{', '.join(map(str, options.out))}"
     )
+
+
+def _only(board: Storyboard, sections: Sequence[Section]) -> Storyboard:
+    """Some sections of a figure."""
+    kept = [strip for strip in board.strips if strip.section.lower().replace(" ", "-") in sections]
+    if not kept:
+        raise UsageError(
+            f"--sections is {' '.join(sections)}; these models and this data have "
+            f"{', '.join(board.sections)}; choose of them"
+        )
+    return replace(board, strips=kept)
 
 
 def labels(models: Sequence[str]) -> dict[str, str]:

@@ -153,6 +153,17 @@ def test_command_writes_figure_and_film(tiny_dataset, model_folder, rival_folder
     assert sorted(path.name for path in out[0].parent.iterdir()) == ["a.mp4", "a.png"]
 
 
+def test_sections_can_be_chosen(tiny_dataset, model_folder, rival_folder, tmp_path, capsys):
+    heights = []
+    for sections in ((), ("--sections", "rgb", "scene-flow")):
+        view(tiny_dataset, [model_folder], tmp_path / "a.png", "--scale", "1", *sections)
+        heights.append(len(imageio.imread(tmp_path / "a.png")))
+    assert heights[0] - heights[1] == (2 + 1 + 2 + 2) * 16 + 3 * 3 + 4 * 12  # rows, gaps in sections, gaps between
+    with pytest.raises(SystemExit):
+        view(tiny_dataset, [rival_folder], tmp_path / "a.png", "--sections", "occlusion")
+    assert "have RGB, masks; choose of them" in capsys.readouterr().err
+
+
 def test_start_and_seed_decide_the_clip(tiny_dataset, rival_folder, tmp_path, capsys):
     def line(*more):
         view(tiny_dataset, [rival_folder], tmp_path / "a.png", "--scale", "1", *more)
