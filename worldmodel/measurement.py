@@ -122,7 +122,7 @@ def measure_model(
         if sampling is not None and model.latent_channels:
             for b, start in enumerate(starts.tolist()):
                 clip = Clips(clips.rgb[b : b + 1], clips.depth[b : b + 1], clips.actions[b : b + 1])
-                parts["best"].append(_best(model, clip, start, c, networks, sampling))
+                parts["best"].append(measure_best(model, clip, start, c, networks, sampling))
                 tick(1)
         else:
             tick(len(starts))
@@ -163,9 +163,10 @@ def _tracking(error: Tensor, way: Tensor) -> Statistics:
     return {"tcp_error": (error * counts).unsqueeze(1), "way": (way * counts).unsqueeze(1)}
 
 
-def _best(
+def measure_best(
     model: WorldModel, clip: Clips, start: int, context: int, networks: Networks | None, sampling: Sampling
 ) -> Statistics:
+    """The best of many futures of one clip, whose first row is `start`."""
     steps = clip.rgb.shape[1] - context
     latents = draw_latents(model, sampling.samples, steps, (sampling.seed, start))
     futures = predict_futures(model, clip, context, latents)
