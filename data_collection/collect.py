@@ -7,13 +7,14 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Literal
 
 from tqdm import tqdm
 
 from data_collection.environments import resolve_env, usual_policy, versions
 from data_collection.files import locked, remove_leftovers
 from data_collection.manifest import MANIFEST_NAME, Manifest, read_manifest
+from data_collection.policies import POLICIES
+from data_collection.policies.stable_baselines import SUFFIX, policy_name
 from data_collection.schema import SHARD_PATTERN, read_shard
 from data_collection.workers import Collected, collect_episodes
 from data_collection.writer import shard_path
@@ -28,7 +29,8 @@ class Config:
     out: Path
     """Folder of the dataset; made if it is not there."""
     env: str = "tabletop"
-    """Environment: a short name (tabletop, planar-push), or any Gymnasium id whose environment has a `camera`."""
+    """Environment: a short name (tabletop, planar-push, dexhand), or any Gymnasium id whose environment has a
+    `camera`."""
     scene: str | None = None
     """Scene or split, where the environment has several (tabletop: A, B, C, D, usually C; planar-push: train,
     validation, test, all, usually train)."""
@@ -36,9 +38,10 @@ class Config:
     """Episodes the dataset shall have; a larger number extends it."""
     steps: int = 240
     """Actions in an episode, which has one frame more."""
-    policy: Literal["play", "push", "noise", "random"] | None = None
-    """Who acts: scripted play (tabletop), scripted pushes (planar-push), smooth coloured noise, or uniform noise;
-    usually the environment's own script."""
+    policy: str | None = None
+    """Who acts: play (a script for the tabletop), push (one for planar-push), predictive (a search in the simulator,
+    for dexhand), noise (smooth), random (uniform); usually the environment's own. Or the .zip of any policy that
+    Stable-Baselines3 trained, as train-policy makes it; loading one runs code that is in it."""
     seed: int = 0
     """With the number of an episode it fixes that episode, whatever the number of workers."""
     workers: int = 2
@@ -57,15 +60,21 @@ class Config:
                 raise UsageError(f"--{option} is {getattr(self, name)}; give a whole number of at least {least}")
         if not self.episode_timeout > 0:
             raise UsageError(f"--episode-timeout is {self.episode_timeout}; give a positive number of seconds")
+        if self.policy is not None and self.policy not in POLICIES and not self.policy.endswith(SUFFIX):
+            raise UsageError(
+                f"--policy is '{self.policy}'; choose one of {', '.join(POLICIES)}, or give a {SUFFIX} of "
+                "Stable-Baselines3"
+            )
         if self.out.exists() and not self.out.is_dir():
             raise UsageError(f"--out {self.out} is a file; give a folder")
 
     def manifest(self) -> Manifest:
         env_id, env_kwargs = resolve_env(self.env, self.scene)
+        policy = self.policy or usual_policy(self.env)
         return Manifest(
             env_id=env_id,
             env_kwargs={**env_kwargs, "image_size": self.image_size},
-            policy=self.policy or usual_policy(self.env),
+            policy=policy_name(Path(policy)) if policy.endswith(SUFFIX) else policy,
             seed=self.seed,
             steps=self.steps,
             ground_truth=self.ground_truth,

@@ -40,6 +40,7 @@ class KnownEnv:
 KNOWN_ENVS: dict[str, KnownEnv] = {
     "tabletop": KnownEnv("t3vip/Tabletop{scene}-v0", scenes=("C", "A", "B", "D")),
     "planar-push": KnownEnv("t3vip/PlanarPush-v0", "push", ("train", "validation", "test", "all"), "split"),
+    "dexhand": KnownEnv("t3vip/DexHand-v0", "predictive", kwargs={"new_goals": True}),
 }
 
 

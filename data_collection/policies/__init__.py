@@ -5,18 +5,19 @@ from __future__ import annotations
 from data_collection.policies.base import Policy
 from envs.errors import UsageError
 
-POLICIES = ("play", "push", "noise", "random")
+POLICIES = ("play", "push", "predictive", "noise", "random")
 
 
 def make_policy(name: str) -> Policy:
     """A new policy.
 
     Args:
-        name: "play" and "push" (scripts for the tabletop and for planar pushing, which look into the simulator),
-            "noise" (coloured noise) or "random" (uniform).
+        name: "play" and "push" (scripts for the tabletop and for planar pushing) and "predictive" (a search, for the
+            dexterous hand), which look into the simulator, "noise" (coloured noise), "random" (uniform), or what
+            `stable_baselines.policy_name` gives.
 
     Raises:
-        UsageError: no such policy.
+        UsageError: no such policy, or a policy file that cannot be loaded.
     """
     if name == "play":
         from data_collection.policies.play import PlayPolicy
@@ -26,6 +27,10 @@ def make_policy(name: str) -> Policy:
         from data_collection.policies.push import PushPolicy
 
         return PushPolicy()
+    if name == "predictive":
+        from data_collection.policies.predictive import PredictivePolicy
+
+        return PredictivePolicy()
     if name == "noise":
         from data_collection.policies.coloured_noise import NoisePolicy
 
@@ -34,6 +39,10 @@ def make_policy(name: str) -> Policy:
         from data_collection.policies.random import RandomPolicy
 
         return RandomPolicy()
+    if "#" in name:
+        from data_collection.policies.stable_baselines import StableBaselinesPolicy
+
+        return StableBaselinesPolicy(name)
     raise UsageError(f"no policy named '{name}'; choose one of {', '.join(POLICIES)}")
 
 

@@ -14,7 +14,6 @@ from envs.errors import UsageError
 
 ACTUATORS, JOINTS = 20, 24  # the last two joints of each of four fingers are coupled by a tendon
 ACTION_AGGREGATION = ("last",) * ACTUATORS
-ACTION_SCALE = (1.0,) * ACTUATORS  # halves of each actuator's range
 
 
 def check_action(action: ArrayLike) -> NDArray[np.float64]:
@@ -35,6 +34,12 @@ def joint_targets(model: mujoco.MjModel, actions: NDArray[np.float64]) -> NDArra
     """Actions (..., 20) in [-1, 1] as joint targets (..., 20), radians: -1 and 1 are the ends of the ranges."""
     low, high = model.actuator_ctrlrange.T
     return low + (actions + 1) / 2 * (high - low)
+
+
+def action_scale(model: mujoco.MjModel) -> tuple[float, ...]:
+    """What 1 stands for, rad, for each of 20 actuators: half of its range."""
+    low, high = model.actuator_ctrlrange.T
+    return tuple(float(half) for half in (high - low) / 2)
 
 
 def actions_of(model: mujoco.MjModel, targets: NDArray[np.float64]) -> NDArray[np.float64]:

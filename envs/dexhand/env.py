@@ -46,7 +46,6 @@ class DexHandEnv(gymnasium.Env):
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": CONTROL_RATE}  # noqa: RUF012
     ACTION_AGGREGATION = control.ACTION_AGGREGATION
-    ACTION_SCALE = control.ACTION_SCALE
     control_rate = CONTROL_RATE
 
     def __init__(
@@ -69,6 +68,7 @@ class DexHandEnv(gymnasium.Env):
         self.render_mode, self.images = render_mode, images
         self.mj_model = build_model()
         self.mj_data = mujoco.MjData(self.mj_model)
+        self.ACTION_SCALE = control.action_scale(self.mj_model)
         self._scratch: mujoco.MjData | None = None
         self._index_model()
         self._goal_seed, self._goals_reached = 0, 0

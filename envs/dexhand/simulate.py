@@ -27,6 +27,8 @@ class Paths:
     """(N, T, 7) position, metres, and unit quaternion wxyz."""
     joint_angles: NDArray[np.float64]
     """(N, T, 24) radians."""
+    end: NDArray[np.float64]
+    """(N, P) physics at the end, for `go_on`."""
 
 
 class BatchSimulator:
@@ -61,13 +63,30 @@ class BatchSimulator:
         Raises:
             UsageError: the shapes do not fit, or an action is not finite.
         """
+        return self.go_on(*self._unpack(states, len(np.atleast_1d(actions))), actions)
+
+    def physics(self, state: ArrayLike) -> NDArray[np.float64]:
+        """What moves in a state (S,) from `DexHandEnv.get_state`: (P,), as `go_on` takes it."""
+        return self._unpack(state, 1)[0][0]
+
+    def go_on(self, physics: NDArray[np.float64], warmstart: NDArray[np.float64] | None, actions: ArrayLike) -> Paths:
+        """`rollout` from the end of others.
+
+        Args:
+            physics: (N, P), `Paths.end`.
+            warmstart: (N, V) of the solver. Without it, results differ from the environment's by what the solver
+                tolerates.
+            actions: (N, T, 20) in [-1, 1]; clipped.
+
+        Raises:
+            UsageError: actions have another shape, or are not finite.
+        """
         actions = np.asarray(actions, np.float64)
         if actions.ndim != 3 or actions.shape[2] != control.ACTUATORS or not np.isfinite(actions).all():
             raise UsageError(f"actions have shape {actions.shape}; give finite numbers of shape (N, T, 20)")
         targets = control.joint_targets(self._model, np.clip(actions, -1, 1))
-        physics, warmstart = self._unpack(states, len(actions))
         size = max(1, CHUNK_STEPS // max(1, actions.shape[1]))
-        cubes, hands = [np.empty((0, actions.shape[1], 7))], [np.empty((0, actions.shape[1], control.JOINTS))]
+        paths = [np.empty((0, actions.shape[1], physics.shape[1]))]
         for first in range(0, len(actions), size):
             some = slice(first, first + size)
             visited, _ = self._pool.rollout(
@@ -75,12 +94,11 @@ class BatchSimulator:
                 self._data,
                 initial_state=physics[some],
                 control=np.repeat(targets[some], SUBSTEPS, axis=1),
-                initial_warmstart=warmstart[some],
+                initial_warmstart=None if warmstart is None else warmstart[some],
             )
-            after = visited[:, SUBSTEPS - 1 :: SUBSTEPS]
-            cubes.append(after[..., self._cube].copy())
-            hands.append(after[..., self._hand].copy())
-        return Paths(np.concatenate(cubes), np.concatenate(hands))
+            paths.append(visited[:, SUBSTEPS - 1 :: SUBSTEPS].copy())
+        after = np.concatenate(paths)
+        return Paths(after[..., self._cube], after[..., self._hand], after[:, -1])
 
     def _unpack(self, states: ArrayLike, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Full physics states and warm starts of the solver, one row for each sequence."""

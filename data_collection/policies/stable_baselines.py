@@ -1,0 +1,113 @@
+"""Any policy that Stable-Baselines3 trained, from its zip file.
+
+Such a file holds pickled Python objects: loading one runs what is in it, so load only what you trust.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.errors import UsageError
+
+SUFFIX = ".zip"
+ALGORITHMS = {
+    "stable_baselines3.sac.policies": ("stable_baselines3", "SAC"),
+    "stable_baselines3.td3.policies": ("stable_baselines3", "TD3"),  # and DDPG's, which is TD3 without its additions
+    "stable_baselines3.common.policies": ("stable_baselines3", "PPO"),  # and A2C's
+    "sb3_contrib.tqc.policies": ("sb3_contrib", "TQC"),
+}
+"""The module of a policy's class -> where the algorithm is that can load it."""
+NOT_NEEDED = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
+"""What training had and acting has no use for; HER's buffer could not even be made without an environment."""
+
+
+def policy_name(path: Path) -> str:
+    """How a dataset names a policy file: its path, and a digest, so that nobody goes on with another by mistake.
+
+    Raises:
+        UsageError: there is no such file.
+    """
+    if not path.is_file():
+        raise UsageError(f"there is no policy file {path}; make one with train-policy, or name a policy")
+    return f"{path}#{_digest(path)}"
+
+
+class StableBaselinesPolicy:
+    """Acts as trained, without exploration.
+
+    Args:
+        name: from `policy_name`.
+
+    Raises:
+        UsageError: the file is not there, is another one by now, or is none of Stable-Baselines3's.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._path, self._model = _load_once(name)
+
+    def reset(self, env: gymnasium.Env, rng: np.random.Generator) -> None:
+        """Start an episode.
+
+        Raises:
+            UsageError: the policy was trained for other observations or actions.
+        """
+        wanted, action = self._model.observation_space, self._model.action_space
+        offered = getattr(env.observation_space, "spaces", {})
+        self._keys = tuple(getattr(wanted, "spaces", {}))
+        missing = sorted(set(self._keys) - set(offered))
+        if not self._keys or missing:
+            raise UsageError(
+                f"{self._path} observes {missing or wanted}, which this environment does not offer (it has "
+                f"{', '.join(offered)}); train the policy in the environment that it shall act in"
+            )
+        if action.shape != env.action_space.shape:
+            raise UsageError(
+                f"{self._path} gives actions {action.shape}, the environment takes {env.action_space.shape}"
+            )
+
+    def act(self, obs: dict[str, Any]) -> NDArray[Any]:
+        """The action that the policy thinks best."""
+        return self._model.predict({key: obs[key] for key in self._keys}, deterministic=True)[0]
+
+
+@functools.lru_cache(maxsize=1)  # a worker makes a new policy for each episode
+def _load_once(name: str) -> tuple[Path, Any]:
+    path, _, digest = name.rpartition("#")
+    if not Path(path).is_file() or _digest(Path(path)) != digest:
+        raise UsageError(f"{path} is not the policy it was when this dataset was begun; choose another --out")
+    return Path(path), load_model(Path(path))
+
+
+def load_model(path: Path, **changes: Any) -> Any:
+    """The Stable-Baselines3 model of a zip file, on the CPU.
+
+    Args:
+        path: of the file.
+        changes: passed on to the algorithm's `load`; without any, what only training needs is left out.
+
+    Raises:
+        UsageError: it is none.
+    """
+    try:
+        with zipfile.ZipFile(path) as file:
+            module = json.loads(file.read("data"))["policy_class"]["__module__"]
+        package, algorithm = ALGORITHMS[module]
+        loader = getattr(importlib.import_module(package), algorithm)
+        return loader.load(path, device="cpu", **(changes or {"custom_objects": NOT_NEEDED}))
+    except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError, ImportError) as error:
+        known = ", ".join(name for _, name in ALGORITHMS.values())
+        raise UsageError(f"{path} is no policy that can be loaded here ({error!r}); give a zip of {known}") from error
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]

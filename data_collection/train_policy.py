@@ -1,0 +1,174 @@
+"""`train-policy`: train a policy with Stable-Baselines3 and hindsight relabelling, for `collect-rollouts --policy`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from tqdm import tqdm
+
+from data_collection.environments import resolve_env
+from data_collection.files import written_aside
+from data_collection.policies.stable_baselines import SUFFIX, load_model
+from envs.command import run
+from envs.errors import UsageError
+
+DISCOUNT, POLYAK, GOALS_A_STEP = 0.98, 0.05, 4  # Plappert et al. (2018), but for the discount of a shorter episode
+LEARNING_STARTS = 1000  # steps of random actions before the first update
+NOISE = 0.1  # standard deviation of DDPG's and TD3's exploration
+NETWORK = [256, 256, 256]
+
+
+@dataclass(frozen=True)
+class Config:
+    """Train a goal-conditioned policy from the simulator's state, without pictures. Same command: goes on."""
+
+    out: Path
+    """The policy, a .zip file; written every `save_every` steps and at the end."""
+    env: str = "dexhand"
+    """Environment with goals: a short name (dexhand), or a Gymnasium id."""
+    algorithm: Literal["sac", "td3", "ddpg"] = "sac"
+    """All learn from a replay buffer with hindsight experience replay (HER)."""
+    steps: int = 1_000_000
+    """Control steps, over all parts of a run that was interrupted."""
+    goal_angle: float = 180.0
+    """Goals are no further than this from the cube at the start, degrees (dexhand)."""
+    reward: Literal["sparse", "dense"] = "sparse"
+    """0 or -1, or the distance to the goal (dexhand)."""
+    learning_rate: float = 1e-3
+    """Adam's."""
+    batch: int = 256
+    """Transitions an update."""
+    updates_every: int = 1
+    """Steps from one update to the next."""
+    buffer: int = 500_000
+    """Transitions that are kept; a run that goes on begins with none."""
+    save_every: int = 10_000
+    """Steps from one save to the next."""
+    trials: int = 20
+    """Episodes to try the policy in at the end; 0 for none."""
+    seed: int = 0
+    """Decides goals, starts, weights and exploration."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "updates_every", "buffer", "save_every"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"--{name.replace('_', '-')} is {getattr(self, name)}; give at least 1")
+        for name in ("trials", "seed"):
+            if getattr(self, name) < 0:
+                raise UsageError(f"--{name} is {getattr(self, name)}; give 0 or more")
+        if self.out.suffix != SUFFIX:
+            raise UsageError(f"--out is {self.out}; give a file that ends in {SUFFIX}")
+        if not self.learning_rate > 0:
+            raise UsageError(f"--learning-rate is {self.learning_rate}; give a positive number")
+
+
+def main(config: Config) -> None:
+    """Train, save, try."""
+    env = _make_env(config)
+    model = _model(config, env)
+    config.out.parent.mkdir(parents=True, exist_ok=True)
+    missing = config.steps - model.num_timesteps
+    with tqdm(total=config.steps, initial=model.num_timesteps, unit="step", dynamic_ncols=True) as bar:
+        if missing > 0:
+            model.learn(missing, callback=_callback(config, bar.update), reset_num_timesteps=False)
+    save(model, config.out)
+    print(f"{config.out}: {model.num_timesteps} steps; use it with: collect-rollouts --policy {config.out}")
+    if config.trials:
+        print(_trial(config, env, model))
+
+
+def save(model: Any, path: Path) -> None:
+    """Write a model, whole or not at all."""
+    with written_aside(path) as aside, aside.open("wb") as file:
+        model.save(file)
+
+
+def _make_env(config: Config) -> gymnasium.Env:
+    env_id, env_kwargs = resolve_env(config.env, None)
+    if config.env == "dexhand" or "DexHand" in env_id:
+        env_kwargs = {**env_kwargs, "goal_angle": config.goal_angle, "reward_type": config.reward, "new_goals": False}
+    try:
+        env = gymnasium.make(env_id, disable_env_checker=True, **{**env_kwargs, "images": False})
+    except (gymnasium.error.Error, ModuleNotFoundError, TypeError) as error:
+        raise UsageError(f"cannot make environment '{env_id}': {error}; check --env") from error
+    if not hasattr(env.unwrapped, "compute_reward"):
+        raise UsageError(f"environment '{env_id}' has no goals (no compute_reward); choose one that has, as dexhand")
+    return env
+
+
+def _model(config: Config, env: gymnasium.Env) -> Any:
+    """A new model, or the one that an interrupted run left."""
+    import stable_baselines3 as sb3
+
+    if config.out.exists():
+        return load_model(config.out, env=env)
+    algorithm = {"sac": sb3.SAC, "td3": sb3.TD3, "ddpg": sb3.DDPG}[config.algorithm]
+    assert env.action_space.shape is not None
+    size = env.action_space.shape[0]
+    explore: dict[str, Any] = {}
+    if config.algorithm != "sac":
+        from stable_baselines3.common.noise import NormalActionNoise
+
+        explore["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, NOISE))
+    return algorithm(
+        "MultiInputPolicy",
+        env,
+        replay_buffer_class=sb3.HerReplayBuffer,
+        replay_buffer_kwargs={"n_sampled_goal": GOALS_A_STEP, "goal_selection_strategy": "future"},
+        learning_rate=config.learning_rate,
+        batch_size=config.batch,
+        train_freq=config.updates_every,
+        buffer_size=config.buffer,
+        learning_starts=min(LEARNING_STARTS, config.steps // 2),
+        gamma=DISCOUNT,
+        tau=POLYAK,
+        policy_kwargs={"net_arch": NETWORK},
+        seed=config.seed,
+        device="auto",
+        **explore,
+    )
+
+
+def _callback(config: Config, update: Callable[[int], Any]) -> Any:
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    class Progress(BaseCallback):
+        """Says how far it is, saves now and then."""
+
+        def _on_step(self) -> bool:
+            update(1)
+            if self.num_timesteps % config.save_every == 0:
+                save(self.model, config.out)
+            return True
+
+    return Progress()
+
+
+def _trial(config: Config, env: gymnasium.Env, model: Any) -> str:
+    """What the policy achieves, in words."""
+    reached, first, last, dropped = 0, [], [], 0
+    for number in range(config.trials):
+        obs, info = env.reset(seed=config.seed + 10_000 + number)
+        first.append(info.get("rotation_error", np.nan))
+        over = False
+        while not over:
+            obs, _, terminated, truncated, info = env.step(model.predict(obs, deterministic=True)[0])
+            over = terminated or truncated
+        reached += bool(info.get("is_success", False))
+        dropped += bool(info.get("is_dropped", False))
+        last.append(info.get("rotation_error", np.nan))
+    start, end = np.degrees(np.median(first)), np.degrees(np.median(last))
+    return (
+        f"in {config.trials} episodes: goal reached at the end of {reached}, dropped in {dropped}; "
+        f"median rotation error {start:.0f} degrees at the start, {end:.0f} at the end"
+    )
+
+
+def command() -> None:
+    """Entry point of `train-policy`."""
+    run(Config, main)
