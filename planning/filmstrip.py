@@ -13,7 +13,7 @@ from data_collection.files import written_aside
 from planning.episode import THRESHOLDS, Record
 from planning.film import VIEWS, film_path
 
-COLUMNS = 6
+COLUMNS = 5
 GAP = 6  # white pixels between the models
 
 
@@ -53,12 +53,15 @@ def filmstrip(videos: Path, filmed: Mapping[str, Sequence[Record]], path: Path) 
 def telling(couple: Sequence[Record]) -> tuple[bool, bool, float]:
     """How well an episode of T3VIP and one of a rival show the difference: the more the better.
 
-    Best is where the rival reaches the pixel and misses the point, while T3VIP reaches it; then, the farther the miss.
+    Best is where the rival reaches the pixel and misses the point, while T3VIP reaches it; then, the nearer it ends to
+    the pixel and the farther from the point, as shares of the way.
     """
     ours, theirs = couple
     threshold = THRESHOLDS[0]
     misses = theirs.success(threshold, "2d") and not theirs.success(threshold, "3d")
-    return misses and ours.success(threshold, "3d"), misses, theirs.final_distance - ours.final_distance
+    beside = theirs.final_distance / theirs.initial_distance
+    beside -= theirs.final_pixel_distance / theirs.initial_pixel_distance
+    return misses and ours.success(threshold, "3d"), misses, beside
 
 
 def _stacked(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:

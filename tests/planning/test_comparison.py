@@ -15,7 +15,7 @@ from planning.report import summarise, table
 SHARES = (0.1, 0.3, 0.5, 0.8)  # of the way along the optical axis: one setup in each bin
 
 
-def record(model, setup, share, space3d, space2d, final=0.1):
+def record(model, setup, share, space3d, space2d, final=0.1, pixels=1.0):
     return Record(
         model=model,
         setup=setup,
@@ -27,7 +27,7 @@ def record(model, setup, share, space3d, space2d, final=0.1):
         hits_3d=[5 * space3d, 0, 0],
         hits_2d=[5 * space2d, 0, 0],
         final_distance=final,
-        final_pixel_distance=1.0,
+        final_pixel_distance=pixels,
         least_distance=final,
         plan_seconds=0.1,
         distances=[final],
@@ -90,8 +90,9 @@ def test_the_most_telling_setup_is_a_reached_pixel_and_a_missed_point():
     ours = record("t3vip", 0, 0.5, 1, 1, final=0.01)
     reached, chance = record("sv2p", 0, 0.5, 0, 1, final=0.1), record("sv2p", 0, 0.5, 1, 1, final=0.01)
     lost, farther = record("sv2p", 0, 0.5, 0, 0, final=0.4), record("sv2p", 0, 0.5, 0, 1, final=0.2)
+    away = record("sv2p", 0, 0.5, 0, 1, final=0.2, pixels=8.0)
     failed = record("t3vip", 0, 0.5, 0, 1, final=0.01)
-    order = [(ours, farther), (ours, reached), (failed, farther), (ours, lost), (ours, chance)]
+    order = [(ours, farther), (ours, reached), (ours, away), (failed, farther), (ours, lost), (ours, chance)]
     assert sorted(order, key=telling, reverse=True) == order
 
 
@@ -105,7 +106,7 @@ def test_film_strip_shows_that_setup_at_common_times(fleet, tmp_path):
     filmed["sv2p"][2] = record("sv2p", 2, 0.5, 0, 1, final=0.3)
     assert filmstrip(tmp_path, filmed, tmp_path / "filmstrip.png")
     strip = iio.imread(tmp_path / "filmstrip.png").astype(int)
-    assert strip.shape == (2 * 64 + 6, 6 * 32, 3)  # a model's two views of 32 x 32 on top of each other
+    assert strip.shape == (2 * 64 + 6, 5 * 32, 3)  # a model's two views of 32 x 32 on top of each other
     ours, theirs = strip[10, ::32, 0], strip[80, ::32, 0]
     assert abs(ours[0] - 60) < 8 and abs(theirs[0] - 160) < 8
     assert abs(ours[-1] - 95) < 8 and abs(theirs[-1] - 240) < 8  # the shorter film stays at its last frame

@@ -51,6 +51,15 @@ def test_first_samples_spread_as_asked():
     np.testing.assert_allclose(cost.batches[0].std(axis=0), 0.1 * kept_mean, rtol=0.06)
 
 
+def test_at_the_default_horizon_samples_spread_twice_as_far():
+    """As documented: the noise keeps its mean, and in a series of two there is as much of that as of the rest."""
+    planner, cost = make(population=4000, iterations=1, init_std=0.1), Recorder()
+    planner.plan(cost)
+    assert ICEMConfig().horizon == 2
+    np.testing.assert_allclose(cost.batches[0].std(axis=0), 0.2, rtol=0.06)
+    assert abs(np.corrcoef(cost.batches[0][:, :, 0].T)[0, 1]) < 0.06
+
+
 def test_the_mean_joins_in_the_last_iteration_only():
     planner, cost = make(), Recorder()
     means = []

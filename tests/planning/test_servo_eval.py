@@ -76,6 +76,11 @@ def test_t3vip_arrives_in_the_simulator_with_an_exact_model(env, make_exact_mode
     assert episode(env, "t3vip", 1, steps=45).success(0.1, "3d")
 
 
+def test_sv2p_reaches_the_pixel_in_the_simulator_with_an_exact_model(env, make_pixel_model, monkeypatch):
+    monkeypatch.setattr(checkpoint, "load_model", lambda name, device: make_pixel_model(env.unwrapped.camera))
+    assert episode(env, "sv2p", 0, steps=30).success(0.1, "2d")
+
+
 def test_pictures_do_not_know_the_goal(env):
     """Bitwise: other goals, and a film that draws the goal, leave what the controller sees as it is."""
     setup = setup_of(env, 0)
@@ -109,7 +114,9 @@ def test_command_writes_everything_and_resumes_episode_by_episode(tmp_path, run,
     assert entry["episodes"] == 2 and len(entry["success_3d_interval"]) == 2
     for key in ("success_2d", "success_3d", "success_2d_interval", "final_distance_m_median", "plan_seconds_median"):
         assert key in entry
-    assert (tmp_path / "success.png").stat().st_size > 1000
+    assert servo["t3vip_less"] == {} and len(entry["by_axis_bin"]) == 4
+    for picture in ("success.png", "comparison.png"):
+        assert (tmp_path / picture).stat().st_size > 1000
     for suffix in ("mp4", "png"):
         assert (tmp_path / "videos" / f"random-setup00-0.{suffix}").stat().st_size > 1000
 
@@ -157,14 +164,25 @@ def test_mistakes_are_one_line(tmp_path, run, options, word):
     assert code == 2 and word in err and err.count("\n") == 1 and "Traceback" not in err
 
 
-@pytest.mark.parametrize("wrong", ["env", "size", "action"])
+def test_models_of_different_frame_gaps_are_refused(env, tmp_path, make_exact_model, make_pixel_model, monkeypatch):
+    make = {"t3vip": make_exact_model, "sv2p": make_pixel_model}  # gaps of 3 and 1
+    monkeypatch.setattr(checkpoint, "load_model", lambda name, device: make[name](env.unwrapped.camera))
+    with pytest.raises(UsageError, match=r"t3vip 3, sv2p 1.*one frame gap"):
+        main(ServoConfig(out=tmp_path, model=("t3vip", "sv2p"), episodes=1))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("wrong", ["env", "size", "action", "kind"])
 def test_a_checkpoint_that_does_not_fit_is_refused(env, tmp_path, make_exact_model, monkeypatch, wrong):
     camera = env.unwrapped.camera
     if wrong == "size":
         camera = type(camera).from_fovy(48, 48, 10, np.eye(4), 3, 5)
     model = make_exact_model(camera, action_dim=3 if wrong == "action" else 7)
+    if wrong == "kind":
+        model.kind = "sv2p"
     if wrong == "env":
         model.context.env_id = "t3vip/DexHand-v0"
     monkeypatch.setattr(checkpoint, "load_model", lambda name, device: model)
-    with pytest.raises(UsageError, match={"env": "DexHand", "size": "48", "action": "3 numbers"}[wrong]):
+    words = {"env": "DexHand", "size": "48", "action": "3 numbers", "kind": "is a sv2p"}
+    with pytest.raises(UsageError, match=words[wrong]):
         main(ServoConfig(out=tmp_path, model=("t3vip",), episodes=1))
