@@ -36,6 +36,7 @@ APPLICATION = "view-prediction"
 INSTALL = "pip install --constraint constraints.txt --editable '.[viewer]'"
 ARROW_STRIDE = 2  # every other moving pixel of a row and a column gets an arrow
 FRUSTUM_M = 0.5
+BACKGROUND = [228, 231, 236]  # white arms shall not vanish before it
 COLOURS = (255 * PALETTE[[2, 1, 0, 3, 4, 5, 6, 7, 8, 9]]).round().astype(np.uint8)  # the truth's first: green
 
 
@@ -101,16 +102,17 @@ def _rerun() -> Any:
 
 
 def _blueprint(scene: Scene) -> Any:
-    """Above the clouds, each on its own, so that it fills its view, and all in one with the camera; below, pictures."""
+    """Above the clouds, each on its own and together; the camera, far off, in a tab; below, the pictures."""
     rrb = importlib.import_module("rerun.blueprint")
 
     def view(name: str, *contents: str) -> Any:
-        return rrb.Spatial3DView(name=name, origin="world", contents=list(contents), background=[255, 255, 255])
+        return rrb.Spatial3DView(name=name, origin="world", contents=list(contents), background=BACKGROUND)
 
     spatial = [shown.name for shown in scene.models if shown.clouds]
     clouds = [view(name, f"{_entity('world', name)}/**") for name in (TRUTH, *spatial)]
     if spatial:
-        clouds.append(view("all in one", "world/**"))
+        together = view("together", "world/**", "- world/camera/**")
+        clouds.append(rrb.Tabs(together, view("with the camera", "world/**")))
     pictures = [
         rrb.Spatial2DView(name=name, origin=_entity("pictures", name))
         for name in (TRUTH, *(shown.name for shown in scene.models))
@@ -167,7 +169,10 @@ class _Recorder:
             camera_xyz=rr.ViewCoordinates.RDF,
             image_plane_distance=FRUSTUM_M,
         )
-        self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        # Up is z. What the viewer takes for forward is where it first looks: more or less where the camera does.
+        x, y = pose[:2, 2]
+        forward = ("FLU" if x > 0 else "BRU") if abs(x) > abs(y) else ("RFU" if y > 0 else "LBU")
+        self._log("world", getattr(rr.ViewCoordinates, forward), static=True)
         self._log("world/camera", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]), lens, static=True)
 
     def _record_cloud(self, path: str, cloud: _Cloud, colour: NDArray[np.uint8]) -> None:
