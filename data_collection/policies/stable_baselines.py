@@ -27,7 +27,7 @@ ALGORITHMS = {
     "sb3_contrib.tqc.policies": ("sb3_contrib", "TQC"),
 }
 """The module of a policy's class -> where the algorithm is that can load it."""
-NOT_NEEDED = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
+NOT_NEEDED: dict[str, object] = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
 """What training had and acting has no use for; HER's buffer could not even be made without an environment."""
 
 
