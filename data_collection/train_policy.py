@@ -18,7 +18,7 @@ from envs.command import run
 from envs.errors import UsageError
 
 DISCOUNT, POLYAK, GOALS_A_STEP = 0.98, 0.05, 4  # Plappert et al. (2018), but for the discount of a shorter episode
-LEARNING_STARTS = 1000  # steps of random actions before the first update
+LEARNING_STARTS = 1000  # steps before the first update
 NOISE = 0.1  # standard deviation of DDPG's and TD3's exploration
 NETWORK = [256, 256, 256]
 
@@ -105,8 +105,13 @@ def _model(config: Config, env: gymnasium.Env) -> Any:
     """A new model, or the one that an interrupted run left."""
     import stable_baselines3 as sb3
 
+    assert env.spec is not None
+    # relabelling needs a whole episode, and the buffer starts empty also where a run goes on
+    first = max(min(LEARNING_STARTS, config.steps // 2), (env.spec.max_episode_steps or 0) + 1)
     if config.out.exists():
-        return load_model(config.out, env=env)
+        model = load_model(config.out, env=env)
+        model.learning_starts = model.num_timesteps + first
+        return model
     algorithm = {"sac": sb3.SAC, "td3": sb3.TD3, "ddpg": sb3.DDPG}[config.algorithm]
     assert env.action_space.shape is not None
     size = env.action_space.shape[0]
@@ -124,7 +129,7 @@ def _model(config: Config, env: gymnasium.Env) -> Any:
         batch_size=config.batch,
         train_freq=config.updates_every,
         buffer_size=config.buffer,
-        learning_starts=min(LEARNING_STARTS, config.steps // 2),
+        learning_starts=first,
         gamma=DISCOUNT,
         tau=POLYAK,
         policy_kwargs={"net_arch": NETWORK},

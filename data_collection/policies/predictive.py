@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from data_collection.policies.predictive_cost import Array, Weights, step_costs
 from envs.dexhand import DexHandEnv
+from envs.dexhand.goals import rotation_distance
 from envs.dexhand.simulate import BatchSimulator
 from envs.errors import UsageError
 
@@ -34,8 +35,10 @@ class Settings:
     """Moves simulated in a stage."""
     beam: int = 16
     """States kept after a stage."""
-    children: int = 4
-    """Of those, how many at most may come from one state of the stage before."""
+    crowd: int = 3
+    """Of those, how many at most may be `alike`."""
+    alike: float = 0.15
+    """Rad, between the orientations of cubes that are alike."""
     spread: tuple[float, ...] = (0.1, 0.3, 0.6)
     """Standard deviations of moves, in halves of the joints' ranges; equally many moves of each."""
     share: float = 0.4
@@ -45,7 +48,7 @@ class Settings:
     weights: Weights = field(default_factory=Weights)
 
     def __post_init__(self) -> None:
-        for name in ("stage", "ahead", "samples", "beam", "children"):
+        for name in ("stage", "ahead", "samples", "beam", "crowd"):
             if getattr(self, name) < 1:
                 raise UsageError(f"{name} is {getattr(self, name)}; give a whole number of at least 1")
 
@@ -126,16 +129,23 @@ class PredictivePolicy:
         paths = self._simulator.go_on(beam.physics[parents], None, actions)
         costs = step_costs(settings.weights, paths, actions, self._goal)
         way = beam.way[parents] + settings.way * costs.mean(axis=1)
-        kept: list[int] = []
-        children = np.zeros(len(beam.physics), int)
-        for number in np.argsort(way + costs[:, -1], kind="stable"):
-            if children[parents[number]] < settings.children:
-                children[parents[number]] += 1
-                kept.append(number)
-                if len(kept) == settings.beam:
-                    break
+        kept = self._select(way + costs[:, -1], paths.cube_pose[:, -1, 3:])
         moves = np.concatenate([beam.moves[parents[kept]], actions[kept, None]], axis=1)
         return Beam(paths.end[kept], end[kept], moves, way[kept])
+
+    def _select(self, costs: Array, orientations: Array) -> list[int]:
+        """The numbers of the states to keep, the best first, no crowd of any orientation (N, 4) among them.
+
+        A cube lies on a face, and the way to a better face leads over an edge, where it is worse for a while.
+        """
+        settings = self._settings
+        kept: list[int] = []
+        for number in np.argsort(costs, kind="stable"):
+            if np.sum(rotation_distance(orientations[kept], orientations[number]) < settings.alike) < settings.crowd:
+                kept.append(int(number))
+                if len(kept) == settings.beam:
+                    break
+        return kept
 
     def _new_targets(self, targets: Array) -> Array:
         """Where moves from these targets (N, 20) go, (N, 20): nowhere, or some joints somewhere else."""

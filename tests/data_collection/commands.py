@@ -18,6 +18,7 @@ MODULES = {
     "export-dataset": "data_collection.export_dataset",
     "import-dataset": "data_collection.import_dataset",
     "inspect-dataset": "data_collection.inspect_dataset",
+    "train-policy": "data_collection.train_policy",
 }
 ENV_ID = "standin:standin/Square-v0"
 

@@ -1,0 +1,249 @@
+"""Policies for the dexterous hand: the predictive search, policies of Stable-Baselines3, and what becomes of them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from commands import call
+
+from data_collection import goal_scores, train_policy
+from data_collection.dataset import RGBDDataset
+from data_collection.environments import resolve_env, usual_policy
+from data_collection.policies import make_policy
+from data_collection.policies.predictive import PredictivePolicy, Settings
+from data_collection.policies.predictive_cost import Weights, step_costs
+from data_collection.policies.stable_baselines import load_model, policy_name
+from data_collection.rollout import collect_episode
+from envs.dexhand import DexHandEnv, goals
+from envs.dexhand.simulate import BatchSimulator
+from envs.errors import UsageError
+from envs.planar_push import PlanarPushEnv
+
+SMALL = Settings(stage=4, ahead=2, samples=48, beam=8)
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = DexHandEnv(goal_angle=90, images=False)
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A policy of Stable-Baselines3, hardly trained."""
+    path = tmp_path_factory.mktemp("policy") / "hand.zip"
+    config = train_policy.Config(path, steps=110, batch=8, buffer=500, save_every=105, trials=0)
+    train_policy.main(config)
+    return path
+
+
+def act(env: DexHandEnv, policy: PredictivePolicy, seed: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Actions (steps, 20) and rotation errors (steps + 1,), degrees."""
+    observation, info = env.reset(seed=seed)
+    policy.reset(env, np.random.default_rng(seed))
+    actions, errors = [], [info["rotation_error"]]
+    for _ in range(steps):
+        actions.append(policy.act(observation))
+        observation, _, terminated, _, info = env.step(actions[-1])
+        errors.append(info["rotation_error"])
+        assert not terminated
+    return np.array(actions), np.degrees(errors)
+
+
+# --- The predictive policy ------------------------------------------------------------------------------------------
+
+
+def test_the_cube_is_turned_towards_goals(env):
+    errors = np.array([act(env, PredictivePolicy(SMALL), seed, 28)[1] for seed in (1, 2, 4)])
+    assert (errors[:, 0] > 20).all()
+    assert np.median(errors[:, -1] / errors[:, 0]) < 0.5
+
+
+def test_the_same_seed_gives_the_same_episode_and_looking_ahead_changes_nothing(env):
+    policy = PredictivePolicy(SMALL)
+    first = act(env, policy, 3, 6)
+    observation, _ = env.reset(seed=8)
+    state = env.get_state()
+    policy.reset(env, np.random.default_rng(0))
+    policy.act(observation)
+    np.testing.assert_array_equal(env.get_state(), state)
+    again = act(env, PredictivePolicy(SMALL, threads=2), 3, 6)
+    np.testing.assert_array_equal(first[0], again[0])
+    np.testing.assert_array_equal(first[1], again[1])
+
+
+def test_targets_go_smoothly_from_where_they_are(env):
+    actions, _ = act(env, PredictivePolicy(SMALL), 5, 12)
+    within = np.diff(actions.reshape(3, SMALL.stage, 20), axis=1)
+    np.testing.assert_allclose(within[:, 0], within[:, -1], atol=1e-5)  # straight within a stage
+    assert np.abs(actions).max() <= 1
+
+
+def test_the_search_foresees_what_happens(env):
+    observation, _ = env.reset(seed=6)
+    policy = PredictivePolicy(SMALL)
+    policy.reset(env, np.random.default_rng(0))
+    simulator = BatchSimulator(env, 1)
+    policy.act(observation)
+    kept = policy._beam
+    assert kept.moves.shape[1:] == (SMALL.ahead - 1, SMALL.stage, 20)
+    plan = np.concatenate([policy._move, *kept.moves[0]])
+    real = simulator.rollout(env.get_state(), plan[None])
+    np.testing.assert_allclose(real.end[0, :32], kept.physics[0, :32], atol=0.01)  # time, hand and cube
+    simulator.close()
+
+
+def test_a_new_goal_starts_a_new_search(env):
+    observation, _ = env.reset(seed=0)
+    policy = PredictivePolicy(SMALL)
+    policy.reset(env, np.random.default_rng(0))
+    for _ in range(SMALL.stage):
+        env.step(policy.act(observation))
+    before = policy._beam
+    env._set_goal(np.concatenate([goals.HOME, [0, 0, 1, 0]]))
+    policy.act(observation)
+    assert not np.array_equal(policy._beam.physics[: len(before.physics)], before.physics)
+    np.testing.assert_array_equal(policy._goal, env.goal)
+
+
+def test_costs_name_what_is_bad(env):
+    env.reset(seed=0)
+    simulator = BatchSimulator(env, 1)
+    actions = np.zeros((1, 2, 20))
+    paths = simulator.rollout(env.get_state(), actions)
+    simulator.close()
+    pose = paths.cube_pose[0, 0]
+    pose[:3] = goals.HOME
+
+    def cost(goal=None, action=actions, **place):
+        paths.cube_pose[0, 0, :3] = goals.HOME + np.array([place.get(axis, 0.0) for axis in "xyz"])
+        return step_costs(Weights(), paths, action, pose if goal is None else goal)[0, 0]
+
+    turned = pose.copy()
+    turned[3:] = goals.product([np.cos(0.25), 0, 0, np.sin(0.25)], pose[3:])
+    assert cost() == 0
+    assert cost(turned) == pytest.approx(0.5)
+    assert cost(x=0.03) == pytest.approx(Weights().place * 0.01)
+    assert cost(z=-0.1) > Weights().drop
+    assert cost(action=actions + 1) == pytest.approx(Weights().posture)
+    assert cost(z=np.nan) == np.inf
+
+
+def test_bad_input_is_named():
+    with pytest.raises(UsageError, match="beam is 0"):
+        Settings(beam=0)
+    with pytest.raises(UsageError, match="drop is -1"):
+        Weights(drop=-1)
+    other = PlanarPushEnv(images=False)
+    with pytest.raises(UsageError, match="PlanarPushEnv"):
+        make_policy("predictive").reset(other, np.random.default_rng(0))
+    other.close()
+
+
+# --- Collecting ----------------------------------------------------------------------------------------------------
+
+
+def test_the_usual_policy_and_environment():
+    env_id, kwargs = resolve_env("dexhand", None)
+    assert env_id == "t3vip/DexHand-v0"
+    assert kwargs == {"new_goals": True}
+    assert usual_policy("dexhand") == usual_policy(env_id) == "predictive"
+
+
+def test_commands_and_joint_deltas_are_recorded():
+    env = DexHandEnv(image_size=16, supersample=1)
+    columns = collect_episode(env, PredictivePolicy(Settings(stage=2, ahead=1, samples=4)), 5, 0, 0, ground_truth=True)
+    assert columns["action"].shape == (6, 20)
+    assert columns["joint_delta"].shape == (6, 24)
+    assert not columns["joint_delta"][-1].any()
+    np.testing.assert_allclose(columns["joint_delta"][:-1], np.diff(columns["proprio"], axis=0), atol=1e-6)
+    assert np.abs(columns["joint_delta"]).max() > 0.005
+    np.testing.assert_allclose(columns["scene_obs"][:, :3], columns["body_pose"][:, env.body_names.index("object"), :3])
+    env.close()
+
+
+def test_noise_gives_targets_between_the_ends(env):
+    env.reset(seed=0)
+    noise = make_policy("noise")
+    noise.reset(env, np.random.default_rng(0))
+    actions = np.array([noise.act({}) for _ in range(50)])
+    assert (np.abs(actions) < 0.9).mean() > 0.5
+    assert np.abs(np.diff(actions, axis=0)).mean() < 0.3
+
+
+# --- Stable-Baselines3 ---------------------------------------------------------------------------------------------
+
+
+def test_a_trained_policy_acts_in_the_collector(trained, tmp_path):
+    out = tmp_path / "data"
+    options = ["--out", out, "--env", "dexhand", "--policy", trained, "--episodes", "1", "--steps", "4"]
+    code, _, err = call("collect-rollouts", [*map(str, options), "--workers", "1", "--image-size", "16"])
+    assert code == 0, err
+    dataset = RGBDDataset(out)
+    assert dataset.attrs["policy"] == policy_name(trained)
+    model, env = load_model(trained), DexHandEnv(images=False)
+    actions, states = dataset.load("action"), dataset.load("state")
+    for action, state in zip(actions[:-1], states[:-1], strict=True):
+        env.set_state(state)
+        np.testing.assert_allclose(model.predict(env.observation(), deterministic=True)[0], action, atol=1e-5)
+    env.close()
+
+
+def test_training_goes_on_where_it_stopped(trained, tmp_path):
+    path = tmp_path / "hand.zip"
+    path.write_bytes(trained.read_bytes())
+    train_policy.main(train_policy.Config(path, steps=112, batch=8, buffer=500, trials=0))
+    assert load_model(path).num_timesteps == 112
+    with pytest.raises(UsageError, match="is not the policy it was"):
+        make_policy(policy_name(trained).replace(str(trained), str(path)))
+
+
+def test_bad_policy_files_are_named(trained, tmp_path, env):
+    with pytest.raises(UsageError, match="no policy file"):
+        policy_name(tmp_path / "none.zip")
+    broken = tmp_path / "broken.zip"
+    broken.write_bytes(b"nothing")
+    with pytest.raises(UsageError, match=r"broken\.zip is no policy"):
+        make_policy(policy_name(broken))
+    other = PlanarPushEnv(images=False)
+    with pytest.raises(UsageError, match="achieved_goal"):
+        make_policy(policy_name(trained)).reset(other, np.random.default_rng(0))
+    other.close()
+    for arguments, named in (
+        (["--out", "x.zip", "--env", "planar-push"], "has no goals"),
+        (["--out", "x"], r"\.zip"),
+        (["--out", "x.zip", "--steps", "0"], "--steps is 0"),
+    ):
+        code, _, err = call("train-policy", arguments)
+        assert code == 2
+        assert named.replace("\\", "") in err
+    code, _, err = call("collect-rollouts", ["--out", str(tmp_path / "d"), "--policy", "dance"])
+    assert code == 2
+    assert "'dance'" in err
+
+
+# --- Scores --------------------------------------------------------------------------------------------------------
+
+
+def test_scores_compare_policies_from_the_same_starts(tmp_path, capsys):
+    tasks = [
+        {"policy": name, "episode": n, "steps": 4, "goal_angle": 90.0, "seed": 0}
+        for name in ("random", "hold")
+        for n in range(2)
+    ]
+    rows = [goal_scores.play(task) for task in tasks]
+    for n in range(2):
+        assert rows[n]["errors"][0] == rows[2 + n]["errors"][0]
+    assert abs(rows[2]["errors"][-1] - rows[2]["errors"][0]) < 0.2  # nothing moves, nothing turns
+    assert len(rows[0]["errors"]) == 5
+    out = tmp_path / "goals.jsonl"
+    out.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    before = out.read_text()
+    goal_scores.main(goal_scores.Config(out, ("random", "hold"), episodes=2, steps=4))  # all is there already
+    assert out.read_text() == before
+    lines = capsys.readouterr().out.splitlines()
+    start = round(np.degrees(np.median([row["errors"][0] for row in rows[:2]])))
+    assert lines[2].startswith(f"| random | 2 | {start} |")
