@@ -42,7 +42,7 @@ class ViewOptions:
     out: tuple[Path, ...] = ()
     """What to write: any of x.png, x.mp4, x.rrd (a recording for the Rerun viewer)."""
     view: bool = False
-    """Open the 3D view in the Rerun viewer."""
+    """Open the 3D view in the Rerun viewer, and wait until it is closed."""
     episode: int | None = None
     """Which episode of the dataset; the first when not given."""
     start: int | None = None
@@ -131,12 +131,12 @@ def main(options: ViewOptions) -> None:
             write_film(board, path, scale, options.speed)
         else:
             write_scene(scene, path)
-    if options.view:
-        view_scene(scene)
     print(
         f"{', '.join(names.values())}: {options.predicted} predicted frames beside the truth, episode {episode} from "
         f"step {start}{': ' if options.out else ''}{', '.join(map(str, options.out))}"
     )
+    if options.view:
+        view_scene(scene)
 
 
 def _only(board: Storyboard, sections: Sequence[Section]) -> Storyboard:

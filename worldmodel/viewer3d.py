@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import importlib
 import os
+import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,10 +90,17 @@ def write_scene(scene: Scene, path: Path) -> None:
 
 
 def view_scene(scene: Scene) -> None:
-    """Open the viewer and send the scene there; it stays open."""
-    recording = _rerun().RecordingStream(APPLICATION)
-    recording.spawn()
-    _Recorder(scene, recording).record()
+    """Show the scene in the viewer that came with this Python's Rerun, whatever is on the PATH; wait till it is closed.
+
+    Raises:
+        UsageError: the viewer does not start.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{APPLICATION}.rrd"
+        write_scene(scene, path)
+        code = subprocess.run([sys.executable, "-m", "rerun_cli", str(path)]).returncode
+    if code:
+        raise UsageError(f"the Rerun viewer ended with code {code}; write --out FILE.rrd and open it elsewhere")
 
 
 def _rerun() -> Any:

@@ -1,7 +1,9 @@
 """`view-prediction`: figure, film and recording show the prediction beside the truth; mistakes are one line."""
 
+import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import imageio.v3 as imageio
@@ -277,3 +279,20 @@ def test_a_missing_viewer_or_display_is_said_before_any_work(model_folder, tmp_p
     with pytest.raises(SystemExit):
         view("/nowhere", [model_folder], tmp_path / "a.rrd")
     assert "pip install --constraint constraints.txt --editable '.[viewer]'" in capsys.readouterr().err
+
+
+def test_view_opens_the_viewer_on_a_recording(tiny_dataset, rival_folder, capsys, monkeypatch):
+    pytest.importorskip("rerun")
+    opened = []
+
+    def viewer(command):
+        opened.append((command[:-1], Path(command[-1]).read_bytes()[:4]))
+        return subprocess.CompletedProcess(command, 1)
+
+    monkeypatch.setenv("DISPLAY", ":7")
+    monkeypatch.setattr(subprocess, "run", viewer)
+    given = ["--data", str(tiny_dataset), "--models", str(rival_folder), "--predicted", "2", "--view"]
+    with pytest.raises(SystemExit):
+        run(ViewOptions, main, given)
+    assert opened == [([sys.executable, "-m", "rerun_cli"], b"RRF2")]
+    assert "the Rerun viewer ended with code 1" in capsys.readouterr().err
