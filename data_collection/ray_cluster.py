@@ -1,0 +1,69 @@
+"""Ray, started or found quietly: the one engine that spreads trials and episodes over processes and machines."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from envs.errors import UsageError
+
+REACH_S = 5.0
+"""How long to wait for a cluster's address to answer; Ray itself would try for minutes."""
+QUIET = {
+    "RAY_USAGE_STATS_ENABLED": "0",  # nothing is sent anywhere
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # a task without GPUs leaves CUDA_VISIBLE_DEVICES alone; Ray's new way
+    "RAY_TQDM": "0",
+}
+
+
+@contextmanager
+def connect(address: str | None, cpus: int | None) -> Iterator[None]:
+    """Be connected to a Ray cluster.
+
+    Without an address, a cluster of this machine alone is started and ended with the block, and it dies with this
+    process even if that is killed. There is no dashboard, and what workers print does not come here.
+
+    Args:
+        address: `HOST:PORT` of a running cluster's head, `auto` for the one that runs on this machine, or None.
+        cpus: how many CPUs a cluster of our own has; None for all of this machine. A running one has what it has.
+
+    Raises:
+        UsageError: there is no cluster at that address.
+    """
+    for name, value in QUIET.items():
+        os.environ.setdefault(name, value)
+    if address is not None:
+        _check(address)
+    import ray  # takes seconds: only for those who use it
+
+    try:
+        if address is None:
+            ray.init("local", num_cpus=cpus, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+        else:
+            ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        where = "Ray does not start here" if address is None else f"cannot join the Ray cluster at '{address}'"
+        raise UsageError(
+            f"{where} ({str(error).splitlines()[0]}); see what ray start --head says, or leave out --ray"
+        ) from error
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _check(address: str) -> None:
+    if address == "auto":
+        return
+    host, separator, port = address.rpartition(":")
+    if not separator or not host or not port.isdigit() or "/" in address:
+        raise UsageError(f"ray is '{address}'; give HOST:PORT as `ray start --head` says, or auto for this machine's")
+    try:
+        socket.create_connection((host, int(port)), timeout=REACH_S).close()
+    except (OSError, OverflowError) as error:
+        raise UsageError(
+            f"no Ray cluster answers at '{address}' ({error}); start one with ray start --head, or leave out --ray"
+        ) from error
