@@ -97,9 +97,9 @@ class ClipSource:
             )
         return np.concatenate(ranges)
 
-    def sample(self, rng: np.random.Generator, batch: int, frames: int) -> Clips:
-        """Draw a batch of clips uniformly over all places where one can start."""
-        return self.at(rng.choice(self.starts(frames), size=batch), frames)
+    def sample(self, rng: np.random.Generator, batch: int, frames: int, share: slice = slice(None)) -> Clips:
+        """Draw a batch of clips uniformly over all places where one can start; read a share of it."""
+        return self.at(rng.choice(self.starts(frames), size=batch)[share], frames)
 
     def spread(self, count: int, frames: int) -> NDArray[np.int64]:
         """First rows of `count` clips spread evenly over the data, for a fixed validation set."""

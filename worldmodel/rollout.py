@@ -31,7 +31,7 @@ def unroll(
     context: int,
     latents: Tensor | None = None,
     truth: float = 0.0,
-    generator: torch.Generator | None = None,
+    coins: Tensor | None = None,
     still: bool = False,
 ) -> Rollout:
     """Predict every next frame of a clip.
@@ -42,7 +42,8 @@ def unroll(
         context: frames that are always true.
         latents: (B, T-1, Z, H/8, W/8), or None for zeros.
         truth: probability that a later input is the true frame instead of the predicted one (scheduled sampling).
-        generator: draws which.
+        coins: (B, T-1) drawn from [0, 1): where a coin is below `truth`, the frame that it leads to stays true. Needed
+            where `truth` is neither 0 nor 1.
         still: let nothing move.
     """
     rgb, depth = clips.rgb[:, 0], clips.depth[:, 0]
@@ -60,8 +61,8 @@ def unroll(
         elif truth <= 0:
             rgb, depth = prediction.rgb, predicted_depth
         else:
-            chance = torch.rand((rgb.shape[0], 1, 1, 1), generator=generator)
-            true = (chance < truth).to(rgb.device)
+            assert coins is not None
+            true = (coins[:, t] < truth).view(-1, 1, 1, 1)
             rgb = torch.where(true, clips.rgb[:, t + 1], prediction.rgb)
             depth = torch.where(true, clips.depth[:, t + 1], predicted_depth)
     return Rollout(predictions, torch.stack(inputs, dim=1))

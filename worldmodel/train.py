@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -13,13 +13,13 @@ from data_collection.dataset import RGBDDataset
 from data_collection.files import write_json
 from envs import command as command_line
 from envs.errors import UsageError
-from worldmodel.budget import measure_cost
+from worldmodel.budget import Cost, measure_cost
 from worldmodel.clips import ClipSource
 from worldmodel.config import ModelContext
-from worldmodel.devices import find_device
 from worldmodel.memory import keep_freed_memory
 from worldmodel.models import make_model, named_config
 from worldmodel.options import PRESETS, TrainOptions
+from worldmodel.ranks import Ranks, join_ranks
 from worldmodel.trainer import Trainer
 from worldmodel.validation import ValidationSet
 
@@ -32,29 +32,36 @@ HELD_OUT = 10
 
 
 def main(options: TrainOptions) -> None:
-    """Train."""
+    """Train, with all processes that torchrun started."""
     keep_freed_memory()
+    with join_ranks(options.device) as ranks:
+        _train(options, ranks)
+
+
+def _train(options: TrainOptions, ranks: Ranks) -> None:
+    ranks.share(options.batch)  # refuse an odd one before the data is read
     train, validation = _open(options)
     context = _context(train, options)
     kind, architecture = named_config(options.model, options.architecture)
-    device = find_device(options.device)
     hashes = {"train": train.dataset.content_hash, "validation": validation.source.dataset.content_hash}
 
     def make_trainer(options: TrainOptions) -> Trainer:
         torch.manual_seed(options.seed)
-        model = make_model(kind, architecture, context).to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        model = make_model(kind, architecture, context).to(ranks.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         origin = {"options": _document(options), "data": hashes, "versions": {"torch": torch.__version__}}
-        return Trainer(model, options, train, validation, origin)
+        return Trainer(model, options, train, validation, origin, ranks)
 
-    options = existing_run(options) or _claim(_timed(options, make_trainer))
-    make_trainer(options).run()
+    chosen = ranks.decide(lambda: existing_run(options))
+    if chosen is None:
+        cost = None if options.minutes is None else measure_cost(make_trainer, options)  # all train, all measure
+        chosen = ranks.decide(lambda: _claim(_filling(options, cost)))
+    make_trainer(chosen).run()
 
 
-def _timed(options: TrainOptions, make_trainer: Callable[[TrainOptions], Trainer]) -> TrainOptions:
+def _filling(options: TrainOptions, cost: Cost | None) -> TrainOptions:
     """The options with the number of steps that fill the given minutes, if minutes are given."""
-    if options.minutes is None:
+    if options.minutes is None or cost is None:
         return options
-    cost = measure_cost(make_trainer, options)
     options = replace(options, steps=cost.steps_in(60 * options.minutes, options))
     print(
         f"{options.minutes:g} minutes are {options.steps} steps here: {cost.step:.3f} s a step over the run, "
@@ -188,3 +195,7 @@ def _preset(arguments: Sequence[str]) -> TrainOptions:
 def command() -> None:
     """Entry point of `train-worldmodel`."""
     command_line.run(TrainOptions, main, default=_preset)
+
+
+if __name__ == "__main__":  # torchrun -m worldmodel.train
+    command()

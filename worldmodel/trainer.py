@@ -22,9 +22,11 @@ from envs.errors import UsageError
 from worldmodel import losses
 from worldmodel.checkpoint import load_training, save_model, save_training
 from worldmodel.clips import Clips, ClipSource
+from worldmodel.colour_jitter import ColourJitter
 from worldmodel.inference import InferenceNetwork, inference_network
 from worldmodel.options import TrainOptions
 from worldmodel.pictures import picture_prediction
+from worldmodel.ranks import ALONE, Ranks
 from worldmodel.rollout import Rollout, unroll
 from worldmodel.t3vip import T3VIP
 from worldmodel.validation import ValidationSet, summary, validate
@@ -43,6 +45,11 @@ class Trainer:
         train: clips to learn from.
         validation: clips to score on.
         origin: what `save_model` keeps about where the model came from.
+        ranks: the processes that train together. The first alone validates and writes; any number of them goes through
+            the same clips and random draws.
+
+    Raises:
+        UsageError: the ranks cannot share the batch.
     """
 
     def __init__(
@@ -52,9 +59,10 @@ class Trainer:
         train: ClipSource,
         validation: ValidationSet,
         origin: dict[str, Any],
+        ranks: Ranks = ALONE,
     ) -> None:
         self.model, self.options, self.train_clips, self.validation = model, options, train, validation
-        self.origin = origin
+        self.origin, self.ranks, self.share = origin, ranks, ranks.share(options.batch)
         self.device = model.device
         model.precision = getattr(torch, options.precision)
         self.modules: dict[str, torch.nn.Module] = {"model": model}
@@ -64,7 +72,7 @@ class Trainer:
             self.modules["inference"] = self.inference
         parameters = [p for module in self.modules.values() for p in module.parameters()]
         self.parameters = parameters
-        self.optimiser = torch.optim.Adam(parameters, lr=options.learning_rate)
+        self.optimiser = torch.optim.Adam(parameters, lr=options.learning_rate, fused=self.device.type == "cuda")
         self.step, self.best, self.seconds = 0, -math.inf, 0.0
         self.bad_steps = 0
 
@@ -74,12 +82,16 @@ class Trainer:
         state = load_training(options.out, self.modules, self.optimiser)
         if state is not None:
             self.step, self.best, self.seconds = state["step"], state["best"], state["seconds"]
-        writer = SummaryWriter(str(options.out / "tensorboard"), purge_step=self.step)
+        self.ranks.begin_alike(self.parameters, self.step)
+        first = self.ranks.first
+        writer = SummaryWriter(str(options.out / "tensorboard"), purge_step=self.step) if first else None
         started = time.monotonic()
         base_seconds = self.seconds
         waited = 0.0
         terms: dict[str, float] = {}
-        bar = tqdm(total=options.steps, initial=self.step, desc="train", unit="step", dynamic_ncols=True)
+        bar = tqdm(
+            total=options.steps, initial=self.step, desc="train", unit="step", dynamic_ncols=True, disable=not first
+        )
         with _stop_on_sigterm() as stopping:
             while self.step < options.steps:
                 self.model.train()
@@ -92,18 +104,21 @@ class Trainer:
                 bar.update()
                 bar.set_postfix({k: f"{v:.4f}" for k, v in terms.items() if k in ("loss", "rgb", "depth", "knn")})
                 last = self.step == options.steps
-                if self.step % options.log_every == 0 or last:
+                stop = self.ranks.any(stopping())
+                if writer and (self.step % options.log_every == 0 or last):
                     share = waited / max(time.monotonic() - started, 1e-9)
                     self._log(writer, "train", terms | {"seconds": self.seconds, "data_wait": share})
-                if self.step % options.validate_every == 0 or last:
+                if writer and (self.step % options.validate_every == 0 or last):
                     bar.write(self.score(writer))
-                if self.step % options.save_every == 0 or last or stopping():
+                if writer and (self.step % options.save_every == 0 or last or stop):
                     self.save()
-                if stopping():
-                    bar.write(f"stopped at step {self.step}; the same command goes on from here")
+                if stop:
+                    if writer:
+                        bar.write(f"stopped at step {self.step}; the same command goes on from here")
                     break
         bar.close()
-        writer.close()
+        if writer:
+            writer.close()
 
     def update(self, clips: Clips) -> dict[str, float]:
         """One step of Adam on a batch of clips; returns the terms of the loss.
@@ -126,6 +141,7 @@ class Trainer:
         self.bad_steps = 0
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()
+        self.ranks.average_gradients(self.parameters)
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.options.clip_gradient)
         if torch.isfinite(norm):
             self.optimiser.step()
@@ -134,19 +150,24 @@ class Trainer:
         return terms
 
     def objective(self, clips: Clips) -> tuple[Tensor, dict[str, float]]:
-        """The full objective (paper, section III-F) on a batch, and its unweighted terms."""
+        """The full objective (paper, section III-F) on this rank's clips, and its unweighted terms on those of all.
+
+        Every term is a mean over equally many pixels of each clip, so that the mean over ranks is that over the batch.
+        """
         options, weights = self.options, self.options.losses
         noise = torch.Generator().manual_seed(_mix(options.seed, self.step))
         schedule = options.schedule
         truth = 1 - _ramp(self.progress, 0.0, schedule.truth_until)
         latents, kl = self._latents(clips, noise)
-        rollout = unroll(self.model, clips, options.context, latents, truth, noise)
+        coins = self._my(torch.rand((len(clips.rgb) * self.ranks.count, clips.actions.shape[1]), generator=noise))
+        rollout = unroll(self.model, clips, options.context, latents, truth, coins)
         terms = reconstruction_terms(self.model, rollout, clips, weights)
         if kl is not None:
             terms["kl"] = kl
         scale = {**asdict(weights), "kl": weights.kl * _ramp(self.progress, *schedule.kl_ramp)}
         total = torch.stack([scale[name] * value for name, value in terms.items()]).sum()
-        return total, {"loss": float(total.detach()), **{name: float(value.detach()) for name, value in terms.items()}}
+        values = self.ranks.mean(torch.stack([total, *terms.values()]).detach()).tolist()
+        return total, dict(zip(("loss", *terms), values, strict=True))
 
     @property
     def progress(self) -> float:
@@ -162,19 +183,21 @@ class Trainer:
         return self.options.learning_rate * rise * (schedule.final_rate + (1 - schedule.final_rate) * fall)
 
     def next_clips(self) -> Clips:
-        """The clips of this step."""
+        """This rank's clips of this step."""
         rng = np.random.default_rng((self.options.seed, self.step))
         frames = self.options.schedule.clip_length(self.progress)
-        clips = self.train_clips.sample(rng, self.options.batch, frames)
-        return jitter_colours(clips, self.options.colour_jitter, rng).to(self.device)
+        clips = self.train_clips.sample(rng, self.options.batch, frames, self.share).to(self.device)
+        if self.options.colour_jitter <= 0:
+            return clips
+        return ColourJitter.draw(self.options.batch, self.options.colour_jitter, rng).share(self.share).apply(clips)
 
     def _latents(self, clips: Clips, noise: torch.Generator) -> tuple[Tensor | None, Tensor | None]:
         if self.inference is None:
             return None, None
         batch, steps = clips.actions.shape[:2]
-        per_clip = self.model.config.latents == "clip"
-        draws = torch.randn((batch, 1 if per_clip else steps, *self.model.latent_shape), generator=noise)
-        draws = draws.expand(-1, steps, -1, -1, -1).to(self.device)
+        each = 1 if self.model.config.latents == "clip" else steps
+        draws = torch.randn((batch * self.ranks.count, each, *self.model.latent_shape), generator=noise)
+        draws = self._my(draws).expand(-1, steps, -1, -1, -1)
         if self.progress < self.options.schedule.posterior_from:
             return draws, None
         frames = self.model.frame(clips.rgb, clips.depth)
@@ -182,6 +205,11 @@ class Trainer:
             mean, log_variance = self.inference(frames)
         pixels = self.model.camera.height * self.model.camera.width
         return mean + (0.5 * log_variance).exp() * draws, losses.kl_to_prior(mean, log_variance, pixels)
+
+    def _my(self, draws: Tensor) -> Tensor:
+        """This rank's share of random draws for the clips of all ranks, on its device."""
+        each = len(draws) // self.ranks.count
+        return draws[self.ranks.index * each :][:each].to(self.device)
 
     def score(self, writer: SummaryWriter) -> str:
         """Validate, draw a picture, and keep the model if it is the best so far; returns a line for people."""
@@ -239,21 +267,6 @@ def reconstruction_terms(
         flow = rollout.stack("optical_flow").flatten(0, 1)
         terms["optical_smoothness"] = losses.edge_aware_smoothness(flow, pictures)
     return terms
-
-
-def jitter_colours(clips: Clips, strength: float, rng: np.random.Generator) -> Clips:
-    """Change each clip's colours as a whole: order of the channels, gain, offset and gamma; depth stays."""
-    if strength <= 0:
-        return clips
-    batch = clips.rgb.shape[0]
-    order = torch.from_numpy(np.stack([rng.permutation(3) for _ in range(batch)]))
-    picture = torch.gather(clips.rgb, 2, order.view(batch, 1, 3, 1, 1).expand_as(clips.rgb))
-
-    def draw(channels: int) -> Tensor:
-        return torch.from_numpy(rng.uniform(-strength, strength, (batch, 1, channels, 1, 1))).float()
-
-    picture = picture.clamp(min=1e-4) ** torch.exp(draw(1)) * (1 + draw(3)) + 0.5 * draw(1)
-    return Clips(picture.clamp(0, 1), clips.depth, clips.actions)
 
 
 def _ramp(x: float, low: float, high: float) -> float:

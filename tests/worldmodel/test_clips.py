@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 from data_collection.actions import aggregate_actions
 from data_collection.dataset import RGBDDataset
 from envs.errors import UsageError
-from worldmodel.clips import ClipSource
+from worldmodel.clips import Clips, ClipSource
+from worldmodel.colour_jitter import ColourJitter
 from worldmodel.geometry import pixel_rays, project
 from worldmodel.splatting import splat
-from worldmodel.trainer import jitter_colours
 
 GAP, FRAMES = 3, 4
 
@@ -155,12 +155,14 @@ def test_joint_deltas_in_place_of_commands(tmp_path, write_dataset):
 def test_colour_jitter_changes_colours_only_and_whole_clips_alike(source, starts):
     clips = source.at(starts[:4], 2)
     still = torch.stack((clips.rgb[:, 0],) * 2, dim=1)
-    changed = jitter_colours(type(clips)(still, clips.depth, clips.actions), 0.3, np.random.default_rng(0))
+    jitter = ColourJitter.draw(4, 0.3, np.random.default_rng(0))
+    changed = jitter.apply(Clips(still, clips.depth, clips.actions))
     assert changed.depth is clips.depth and changed.actions is clips.actions
     assert torch.equal(changed.rgb[:, 0], changed.rgb[:, 1])
     assert (changed.rgb - still).abs().flatten(1).mean(1).min() > 0.01
     assert changed.rgb.min() >= 0 and changed.rgb.max() <= 1
-    assert jitter_colours(clips, 0.0, np.random.default_rng(0)) is clips
+    of_two = jitter.share(slice(2, 4)).apply(Clips(still[2:], clips.depth[2:], clips.actions[2:]))
+    assert torch.equal(of_two.rgb, changed.rgb[2:])
 
 
 def test_clips_that_no_episode_can_hold_are_refused(source, dataset):

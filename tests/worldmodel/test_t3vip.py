@@ -178,7 +178,8 @@ def test_predictions_look_at_nothing_but_the_context_and_the_actions(model, clip
 def test_scheduled_sampling_takes_the_share_of_true_frames_that_it_is_told(model, clips):
     def share(truth):
         many = Clips(*(x[:1].expand(40, *x.shape[1:]) for x in (clips.rgb, clips.depth, clips.actions)))
-        rollout = unroll(model, many, 2, truth=truth, generator=torch.Generator().manual_seed(0))
+        coins = torch.rand((40, many.actions.shape[1]), generator=torch.Generator().manual_seed(0))
+        rollout = unroll(model, many, 2, truth=truth, coins=coins)
         true = (rollout.input_rgb == many.rgb[:, :-1]).flatten(2).all(2)
         assert true[:, :2].all()
         return float(true[:, 2:].float().mean())

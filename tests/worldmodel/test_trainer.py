@@ -117,6 +117,12 @@ def test_latents_come_from_the_prior_first_and_then_from_the_clip(make_trainer, 
     assert float(trainer.objective(clips)[0].detach()) != unweighted
 
 
+def test_without_jitter_clips_are_as_they_were_recorded(make_trainer):
+    recorded, changed = (make_trainer(colour_jitter=strength).next_clips() for strength in (0.0, 0.3))
+    assert torch.equal(recorded.depth, changed.depth) and not torch.equal(recorded.rgb, changed.rgb)
+    torch.testing.assert_close(recorded.rgb * 255, (recorded.rgb * 255).round())
+
+
 def spoiled(clips):
     rgb = clips.rgb.clone()
     rgb[0, -1, 0, 0, 0] = torch.nan
