@@ -90,19 +90,26 @@ def save_model(
 
 
 def find_model(name: str | Path) -> Path:
-    """The folder of a model: a shipped name (`t3vip`), a training run, or a folder with config.json and weights.
+    """The folder of a model: a shipped name, a training run, or a folder with config.json and weights.
+
+    Shipped models of the tabletop go by their kind (`t3vip`), others by environment and kind (`planar-push/t3vip`).
 
     Raises:
         UsageError: nothing of that kind is there.
     """
-    shipped = sorted(path.name for path in PRETRAINED.glob("*") if (path / WEIGHTS).exists())
     for folder in (PRETRAINED / name, Path(name), Path(name) / "model", Path(name) / "model.old"):
         if (folder / WEIGHTS).is_file() and (folder / CONFIG).is_file():
             return folder
     raise UsageError(
         f"no model at '{name}'; give a training run, a folder with {CONFIG} and {WEIGHTS}, or a shipped name "
-        f"({', '.join(shipped) or 'none is shipped'})"
+        f"({', '.join(shipped_models()) or 'none is shipped'})"
     )
+
+
+def shipped_models() -> list[str]:
+    """Names of the models that come with the package, those of the tabletop first."""
+    folders = (path.parent.relative_to(PRETRAINED) for path in PRETRAINED.rglob(WEIGHTS))
+    return [folder.as_posix() for folder in sorted(folders, key=lambda folder: (len(folder.parts), folder))]
 
 
 def load_model(name: str | Path, device: str | torch.device = "cpu", precision: Precision = "auto") -> WorldModel:

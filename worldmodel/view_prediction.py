@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from data_collection.dataset import RGBDDataset
 from envs import command as command_line
 from envs.errors import UsageError
-from worldmodel.checkpoint import find_model, load_model
+from worldmodel.checkpoint import load_model, shipped_models
 from worldmodel.clips import ClipSource
 from worldmodel.figure import Storyboard, write_film, write_sheet
 from worldmodel.pictures import predict, storyboard
@@ -156,8 +156,8 @@ def labels(models: Sequence[str]) -> dict[str, str]:
     short = {}
     for name in dict.fromkeys(models):
         folder = Path(name)
-        if len(folder.parts) == 1 and find_model(name).name == name and not folder.is_dir():
-            short[name] = name.upper()
+        if name in shipped_models() and not folder.is_dir():
+            short[name] = folder.name.upper()
         else:
             folder = folder.resolve()
             short[name] = folder.parent.name if folder.name == "model" else folder.name

@@ -14,6 +14,7 @@ from worldmodel.checkpoint import (
     STATE,
     TRAINING,
     WEIGHTS,
+    find_model,
     load_inference,
     load_model,
     load_training,
@@ -84,7 +85,9 @@ def test_shipped_models_go_by_name(saved, tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint, "PRETRAINED", tmp_path / "shipped")
     shutil.copytree(folder, tmp_path / "shipped" / "squares")
     assert same(model, load_model("squares"))
-    with pytest.raises(UsageError, match=r"no model at 'circles'; .* shipped name \(squares\)"):
+    shutil.copytree(folder, tmp_path / "shipped" / "planar-push" / "squares")
+    assert find_model("planar-push/squares") == tmp_path / "shipped" / "planar-push" / "squares"
+    with pytest.raises(UsageError, match=r"no model at 'circles'; .* shipped name \(squares, planar-push/squares\)"):
         load_model("circles")
 
 
