@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
+import select
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from typing import TypeVar
@@ -24,8 +27,8 @@ def run(
     """Parse the command line into `config` and hand it to `main`.
 
     A `UsageError`, from the options' own checks or from `main`, ends the process with one line on stderr and exit
-    code 2; so does an option that cannot be parsed; Ctrl-C ends it with 130. Anything else is a bug and keeps its
-    traceback.
+    code 2; so does an option that cannot be parsed; Ctrl-C ends it with 130. Where nobody reads on, as after `| head`,
+    it ends quietly with 141, as others do that SIGPIPE kills. Anything else is a bug and keeps its traceback.
 
     Args:
         config: a dataclass whose field docstrings are the help text.
@@ -34,13 +37,21 @@ def run(
         default: makes, from the arguments, the options that hold where the command line is silent (a preset).
     """
     try:
-        main(parse(config, args, default))
+        try:
+            main(parse(config, args, default))
+        finally:
+            sys.stdout.flush()  # here rather than when Python ends, where it is too late to be quiet
     except UsageError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
+    except BrokenPipeError:
+        if not _reader_is_gone():
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes when it ends
+        sys.exit(128 + signal.SIGPIPE)
 
 
 def parse(
@@ -67,6 +78,13 @@ def parse(
         while cause is not None and not isinstance(cause, UsageError):
             cause = cause.__context__
     raise cause or UsageError(_one_line(box.getvalue()))
+
+
+def _reader_is_gone() -> bool:
+    """Whether stdout is a pipe that nobody reads from any more; other pipes may break as well, and that is a bug."""
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), 0)
+    return bool(poll.poll(0))  # errors are told unasked
 
 
 def _one_line(box: str) -> str:
