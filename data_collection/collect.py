@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -15,8 +16,10 @@ from data_collection.files import locked, remove_leftovers
 from data_collection.manifest import MANIFEST_NAME, Manifest, read_manifest
 from data_collection.policies import POLICIES
 from data_collection.policies.stable_baselines import SUFFIX, policy_name
+from data_collection.process_workers import ProcessPool
+from data_collection.ray_cluster import connect
 from data_collection.schema import SHARD_PATTERN, read_shard
-from data_collection.workers import Collected, collect_episodes
+from data_collection.workers import Collected, WorkerLost, collect_episodes
 from data_collection.writer import shard_path
 from envs.command import run
 from envs.errors import UsageError
@@ -46,6 +49,9 @@ class Config:
     """With the number of an episode it fixes that episode, whatever the number of workers."""
     workers: int = 2
     """Processes that collect."""
+    ray: str | None = None
+    """Have them on a Ray cluster: HOST:PORT of its head, auto for the one that runs here, local for one that is started
+    here and ends with the command. The episodes are the same; only this process writes them."""
     image_size: int = 64
     """Height and width of the images, pixels."""
     ground_truth: bool = False
@@ -91,13 +97,28 @@ def main(config: Config) -> None:
         missing = [number for number in range(config.episodes) if not shard_path(folder, number).exists()]
         done = config.episodes - len(missing)
         with tqdm(total=config.episodes, initial=done, unit="episode", desc=folder.name, file=sys.stderr) as progress:
-            for event in collect_episodes(manifest, folder, missing, config.workers, config.episode_timeout):
+            for event in _collect(config, manifest, missing):
                 if isinstance(event, Collected):
                     progress.update()
                 else:
                     lost = f"{event.worker} lost episode {event.episode}: {event.reason}"
                     progress.write(f"{lost}; replaced, the episode starts again", file=sys.stderr)
     print(f"{config.episodes} episodes in {folder}; look at them with: inspect-dataset {folder}")
+
+
+def _collect(config: Config, manifest: Manifest, missing: list[int]) -> Iterator[Collected | WorkerLost]:
+    """Collect the missing episodes with the workers that are asked for."""
+    folder, workers = config.out, min(config.workers, len(missing))
+    if config.ray is None or not missing:
+        yield from collect_episodes(ProcessPool(manifest, folder, config.episode_timeout), folder, missing, workers)
+        return
+    with connect(None if config.ray == "local" else config.ray, workers):
+        from data_collection.ray_workers import RayPool  # it takes seconds to import Ray: only for those who use it
+
+        on_ray = RayPool(manifest, folder, config.episode_timeout)
+        if on_ray.cpus < workers:
+            print(f"the Ray cluster has {on_ray.cpus} CPUs: so many workers, not {workers}", file=sys.stderr)
+        yield from collect_episodes(on_ray, folder, missing, max(1, min(workers, on_ray.cpus)))
 
 
 def _begin(manifest: Manifest, folder: Path) -> None:

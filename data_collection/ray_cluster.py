@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import socket
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -39,6 +41,7 @@ def connect(address: str | None, cpus: int | None) -> Iterator[None]:
         _check(address)
     import ray  # takes seconds: only for those who use it
 
+    on_sigterm = signal.getsignal(signal.SIGTERM)
     try:
         if address is None:
             ray.init("local", num_cpus=cpus, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
@@ -49,6 +52,8 @@ def connect(address: str | None, cpus: int | None) -> Iterator[None]:
         raise UsageError(
             f"{where} ({str(error).splitlines()[0]}); see what ray start --head says, or leave out --ray"
         ) from error
+    if callable(on_sigterm) and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, on_sigterm)  # a cluster of our own has put its handler in that place
     try:
         yield
     finally:

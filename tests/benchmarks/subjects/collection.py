@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 from data_collection.collect import Config
+from data_collection.process_workers import ProcessPool
 from data_collection.workers import Collected, collect_episodes
 
 
@@ -22,7 +23,7 @@ def collected_steps(workers: int, episodes: int, steps: int) -> float:
         folder = Path(name)
         manifest = Config(folder, episodes=episodes, steps=steps, workers=workers).manifest()
         ends = []
-        for event in collect_episodes(manifest, folder, range(episodes), workers, timeout=300.0):
+        for event in collect_episodes(ProcessPool(manifest, folder, 300.0), folder, range(episodes), workers):
             if not isinstance(event, Collected):
                 raise RuntimeError(f"episode {event.episode} was lost: {event.reason}")
             ends.append(time.perf_counter())
