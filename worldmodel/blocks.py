@@ -18,6 +18,28 @@ def layer_norm(channels: int) -> nn.Module:
     return nn.GroupNorm(1, channels)
 
 
+class _Join(torch.autograd.Function):
+    """`torch.cat` hands back slices, strided in memory, on which whatever comes next on the way back crawls: a ReLU's
+    backward took 9 ms instead of 1. Copied out, each is dense."""
+
+    @staticmethod
+    def forward(ctx: Any, *features: Tensor) -> Tensor:
+        ctx.channels = [f.shape[1] for f in features]
+        return torch.cat(features, dim=1)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        parts = gradients[0].split(ctx.channels, dim=1)
+        wanted = zip(parts, ctx.needs_input_grad, strict=True)
+        return tuple(part.contiguous(memory_format=torch.channels_last) if needed else None for part, needed in wanted)
+
+
+def join(*features: Tensor) -> Tensor:
+    """Features (B, C_i, H, W) of one precision, side by side: (B, sum of C_i, H, W)."""
+    joined: Tensor = _Join.apply(*features)
+    return joined
+
+
 def _activate(gates: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Gates (B, 4C, H, W) to enter, candidate, forget, leave; float32.
 
@@ -96,5 +118,5 @@ class ConvLSTM(nn.Module):
 
     def forward(self, x: Tensor, state: LSTMState) -> tuple[Tensor, LSTMState]:
         """One step: `(B, inputs, H, W)` to `(B, channels, H, W)` and the new state."""
-        state = lstm_gates(self.gates(torch.cat((x, state[0]), dim=1)), state[1])
+        state = lstm_gates(self.gates(join(x, state[0])), state[1])
         return state[0], state

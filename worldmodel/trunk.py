@@ -7,11 +7,10 @@ frame at full resolution join the last layer (`fine_skip`), of T3VIP and of its 
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from worldmodel.blocks import ConvLSTM, LSTMState, layer_norm
+from worldmodel.blocks import ConvLSTM, LSTMState, join, layer_norm
 from worldmodel.config import ModelConfig
 
 STRIDE = 8
@@ -95,7 +94,7 @@ class Encoder(nn.Module):
         """
         tiled = action[:, :, None, None].to(features.dtype).expand(-1, -1, *features.shape[2:])
         joined = [features, tiled] if latent is None else [features, tiled, latent.to(features.dtype)]
-        x, state = self.lstm5(F.relu(self.join(torch.cat(joined, dim=1))), state)
+        x, state = self.lstm5(F.relu(self.join(join(*joined))), state)
         return self.norm5(x), state
 
 
@@ -124,10 +123,10 @@ class Decoder(nn.Module):
         """Decode to `(B, outputs, H, W)`, no activation; `states` are those of the two LSTMs."""
         *fine, skip0, skip1 = skips
         x, state6 = self.lstm6(F.relu(self.up1(embedding)), states[0])
-        x = torch.cat((self.norm6(x), skip1), dim=1)
+        x = join(self.norm6(x), skip1)
         x, state7 = self.lstm7(F.relu(self.up2(x)), states[1])
-        x = torch.cat((self.norm7(x), skip0), dim=1)
+        x = join(self.norm7(x), skip0)
         x = F.relu(self.up3(x))
         if self.refine is not None:
-            x = F.relu(self.refine(torch.cat((x, *fine), dim=1)))
+            x = F.relu(self.refine(join(x, *fine)))
         return self.head(self.norm8(x)), [state6, state7]
