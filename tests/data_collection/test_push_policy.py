@@ -12,7 +12,7 @@ from envs.errors import UsageError
 from envs.planar_push import PlanarPushEnv
 from envs.tabletop import TabletopEnv
 
-STEPS = 90
+STEPS = 120
 
 
 def episode(env: PlanarPushEnv, seed: int) -> tuple[np.ndarray, np.ndarray]:
