@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,9 @@ from data_collection.schema import (
 )
 from envs.camera import CameraModel
 from envs.errors import UsageError
+
+NEARBY_ROWS = 32
+"""Rows no farther apart are read in one go: they share a chunk, or lie in neighbouring ones."""
 
 
 class RGBDDataset:
@@ -132,6 +137,52 @@ class RGBDDataset:
                 file[column].read_direct(values, dest_sel=np.s_[start:stop])
             start = stop
         return values
+
+    def size_of(self, columns: Sequence[str]) -> int:
+        """Bytes that these columns take in memory.
+
+        Raises:
+            UsageError: no such column.
+        """
+        size = 0
+        for name in columns:
+            self._require(name)
+            size += math.prod(self._shards[0].columns[name]) * np.dtype(COLUMNS[name].dtype).itemsize
+        return size * int(self.episode_lengths.sum())
+
+    def rows(self, columns: Sequence[str], rows: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        """Some rows of some columns, read from the shards by range: what lies far from them is not touched.
+
+        Args:
+            columns: names.
+            rows: of any shape and in any order; numbers of rows in what `load` gives.
+
+        Returns:
+            name -> (*rows.shape, ...), in the stored dtype.
+
+        Raises:
+            UsageError: no such column, or a shard is damaged.
+            IndexError: no such row.
+        """
+        for name in columns:
+            self._require(name)
+        wanted, places = np.unique(rows, return_inverse=True)
+        stops = np.cumsum([shard.rows for shard in self._shards])
+        if len(wanted) and not 0 <= wanted[0] <= wanted[-1] < stops[-1]:
+            raise IndexError(f"rows {wanted[0]} to {wanted[-1]} of a dataset of {stops[-1]}")
+        found = {name: np.empty((len(wanted), *self._shards[0].columns[name]), COLUMNS[name].dtype) for name in columns}
+        stretches = np.flatnonzero(np.diff(wanted) > NEARBY_ROWS) + 1  # where one begins, beside those at shards' ends
+        for number in np.unique(np.searchsorted(stops, wanted, side="right")):
+            shard = self._shards[number]
+            first, last = np.searchsorted(wanted, (stops[number] - shard.rows, stops[number]))
+            local = wanted - (stops[number] - shard.rows)
+            ends = [first, *stretches[(stretches > first) & (stretches < last)], last]
+            with _reading(shard) as file:
+                for here, there in itertools.pairwise(ends):
+                    start, stop = local[here], local[there - 1] + 1
+                    for name in columns:
+                        found[name][here:there] = file[name][start:stop][local[here:there] - start]
+        return {name: values[places.reshape(rows.shape)] for name, values in found.items()}
 
     def episode(self, number: int) -> dict[str, NDArray[Any]]:
         """All columns of one episode, (rows, ...) each, in their stored dtypes.

@@ -1,7 +1,12 @@
-"""Clips of a dataset held in memory: frames a gap apart with the actions between them added up, never dropped."""
+"""Clips of a dataset: frames a gap apart with the actions between them added up, never dropped.
+
+Pictures are held in memory where they fit, and else read from the shards by range, a clip at a time. What is small,
+such as actions and poses, is always held.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -17,6 +22,7 @@ from envs.errors import UsageError
 
 ACTION_COLUMNS = ("action", "joint_delta")
 """What a model may be conditioned on: what was commanded, or how far each joint went, which tells of the outcome."""
+PICTURES = ("rgb", "depth", "segmentation")
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,7 @@ class ClipSource:
         episodes: which episodes to use; all when None.
         share: another source of the same dataset, whose memory this one uses too.
         action_column: one of `ACTION_COLUMNS`.
+        memory_limit: bytes that RGB and depth may take; larger ones stay on the disk. None to hold them always.
     """
 
     def __init__(
@@ -67,6 +74,7 @@ class ClipSource:
         episodes: slice | None = None,
         share: ClipSource | None = None,
         action_column: str = "action",
+        memory_limit: float | None = None,
     ) -> None:
         if frame_gap < 1:
             raise UsageError(f"frame-gap is {frame_gap}; give 1 for adjacent frames, or more")
@@ -75,9 +83,11 @@ class ClipSource:
         self.dataset, self.frame_gap, self.action_column = dataset, frame_gap, action_column
         self._slices = dataset.episode_slices[episodes or slice(None)]
         self._columns: dict[str, NDArray[Any]] = share._columns if share else {}
-        for name in ("rgb", "depth", action_column):
-            if name not in self._columns:
-                self._columns[name] = dataset.load(name)
+        self.in_memory: bool = memory_limit is None or dataset.size_of(("rgb", "depth")) <= memory_limit
+        """Whether pictures are held; what `share` decided holds here too."""
+        if share is not None:
+            self.in_memory = share.in_memory
+        self._hold((action_column, "rgb", "depth") if self.in_memory else (action_column,))
         self.action_dim = int(self._columns[action_column].shape[1])
         self.action_aggregation: tuple[str, ...] = ("sum",) * self.action_dim  # of joint deltas, in radians
         self.action_scale: tuple[float, ...] = (1.0,) * self.action_dim
@@ -87,30 +97,41 @@ class ClipSource:
 
     def starts(self, frames: int) -> NDArray[np.int64]:
         """First rows of all clips of `frames` frames."""
-        span = (frames - 1) * self.frame_gap + 1
-        ranges = [np.arange(start, stop - span + 1) for start, stop in self._slices if stop - start >= span]
-        if not ranges:
-            longest = int(np.diff(self._slices, axis=1).max(initial=0))
-            raise UsageError(
-                f"no episode is {span} frames long, as {frames} frames at gap {self.frame_gap} need (the longest has "
-                f"{longest}); choose a smaller clip length or frame gap"
-            )
-        return np.concatenate(ranges)
+        total = self._places(frames)[1][-1]
+        return self._starts_of(np.arange(total), frames)
 
     def sample(self, rng: np.random.Generator, batch: int, frames: int, share: slice = slice(None)) -> Clips:
         """Draw a batch of clips uniformly over all places where one can start; read a share of it."""
-        return self.at(rng.choice(self.starts(frames), size=batch)[share], frames)
+        total = self._places(frames)[1][-1]
+        return self.at(self._starts_of(rng.integers(0, total, batch), frames)[share], frames)
 
     def spread(self, count: int, frames: int) -> NDArray[np.int64]:
         """First rows of `count` clips spread evenly over the data, for a fixed validation set."""
-        starts = self.starts(frames)
-        return starts[np.linspace(0, len(starts) - 1, min(count, len(starts))).astype(np.int64)]
+        total = self._places(frames)[1][-1]
+        return self._starts_of(np.linspace(0, total - 1, min(count, total)).astype(np.int64), frames)
+
+    def _places(self, frames: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """First rows (E,) of the episodes that can hold a clip, and the number of places (E,) up to each one's end."""
+        span = (frames - 1) * self.frame_gap + 1
+        lengths = self._slices[:, 1] - self._slices[:, 0]
+        if lengths.max(initial=0) < span:
+            raise UsageError(
+                f"no episode is {span} frames long, as {frames} frames at gap {self.frame_gap} need (the longest has "
+                f"{lengths.max(initial=0)}); choose a smaller clip length or frame gap"
+            )
+        long = lengths >= span
+        return self._slices[long, 0], np.cumsum(lengths[long] - span + 1)
+
+    def _starts_of(self, places: NDArray[np.int64], frames: int) -> NDArray[np.int64]:
+        firsts, totals = self._places(frames)
+        episodes = np.searchsorted(totals, places, side="right")
+        return firsts[episodes] + places - np.concatenate([[0], totals])[episodes]
 
     def at(self, starts: NDArray[np.int64], frames: int) -> Clips:
         """The clips that start at these rows."""
-        rows = self._rows(starts, frames)
-        rgb = torch.from_numpy(self._columns["rgb"][rows]).permute(0, 1, 4, 2, 3).float() / 255
-        depth = torch.from_numpy(self.dataset.depth_metres(self._columns["depth"][rows])).unsqueeze(2)
+        stored = self._read(("rgb", "depth"), self._rows(starts, frames))
+        rgb = torch.from_numpy(stored["rgb"]).permute(0, 1, 4, 2, 3).float() / 255
+        depth = torch.from_numpy(self.dataset.depth_metres(stored["depth"])).unsqueeze(2)
         return Clips(rgb, depth, torch.from_numpy(self.actions_at(starts, frames)))
 
     def actions_at(self, starts: NDArray[np.int64], frames: int) -> NDArray[np.float32]:
@@ -130,13 +151,9 @@ class ClipSource:
     def truth_at(self, starts: NDArray[np.int64], frames: int) -> ClipTruth:
         """Scene flow, hand pixels and TCP of the clips that start at these rows; needs a dataset with ground truth."""
         dataset, camera = self.dataset, self.dataset.camera
-        for name in ("segmentation", "body_pose", "proprio"):
-            if name not in self._columns:
-                self._columns[name] = dataset.load(name)
-        rows = self._rows(starts, frames)
-        depth = dataset.depth_metres(self._columns["depth"][rows])
-        bodies = self._columns["segmentation"][rows]
-        poses = self._columns["body_pose"][rows]
+        stored = self._read(("depth", "segmentation", "body_pose", "proprio"), self._rows(starts, frames))
+        depth = dataset.depth_metres(stored["depth"])
+        bodies, poses = stored["segmentation"], stored["body_pose"]
         flow = np.stack(
             [
                 [
@@ -147,7 +164,7 @@ class ClipSource:
             ]
         )
         hand = np.isin(bodies[:, :-1], dataset.attrs["hand_body_ids"])
-        tcp = camera.to_camera(self._columns["proprio"][rows][..., :3].astype(np.float64))
+        tcp = camera.to_camera(stored["proprio"][..., :3].astype(np.float64))
         return ClipTruth(
             torch.from_numpy(flow).permute(0, 1, 4, 2, 3).float(),
             torch.from_numpy(hand),
@@ -160,6 +177,19 @@ class ClipSource:
         actions = self.actions_at(self.spread(samples, 2), 2)[:, 0].astype(np.float64)
         std = actions.std(0)
         return actions.mean(0), np.where(std > 1e-3, std, 1.0)
+
+    def _hold(self, names: Sequence[str]) -> None:
+        for name in names:
+            if name not in self._columns:
+                self._columns[name] = self.dataset.load(name)
+
+    def _read(self, names: Sequence[str], rows: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        """These rows of some columns, from memory or from the disk."""
+        far = [] if self.in_memory else [name for name in names if name in PICTURES]
+        near = [name for name in names if name not in far]
+        self._hold(near)
+        stored = self.dataset.rows(far, rows) if far else {}
+        return stored | {name: self._columns[name][rows] for name in near}
 
     def _rows(self, starts: NDArray[np.int64], frames: int) -> NDArray[np.int64]:
         return np.asarray(starts)[:, None] + np.arange(frames) * self.frame_gap

@@ -1,10 +1,12 @@
-"""Memory that is freed stays with the process, where the C library can be told so."""
+"""How much memory there is; and that what is freed stays with the process, where the C library can be told so."""
 
 from __future__ import annotations
 
 import ctypes
 import functools
+import math
 import sys
+from pathlib import Path
 
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3  # <malloc.h>
 _HELD, _PAD = 1 << 30, 1 << 26  # bytes
@@ -26,3 +28,19 @@ def keep_freed_memory() -> None:
     mallopt(_M_MMAP_THRESHOLD, _HELD)
     mallopt(_M_TRIM_THRESHOLD, _HELD)
     mallopt(_M_TOP_PAD, _PAD)
+
+
+def available_memory() -> float:
+    """Bytes that may still be taken: what the machine has free and, in a container, its limit; inf where untold."""
+    free = math.inf
+    try:
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                free = 1024.0 * int(line.split()[1])
+        group = Path("/sys/fs/cgroup")
+        limit = (group / "memory.max").read_text().strip()
+        if limit != "max":
+            free = min(free, float(limit) - float((group / "memory.current").read_text()))
+    except OSError:  # another system, or no control groups
+        pass
+    return max(free, 0.0)

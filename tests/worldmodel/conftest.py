@@ -154,7 +154,7 @@ def random_vgg() -> dict[str, torch.Tensor]:
     return weights
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def write_dataset() -> Callable[..., Path]:
     return write_squares
 
