@@ -58,6 +58,9 @@ class TrainOptions:
     """Folder of the run: options, metrics, pictures, checkpoints, and the best model in `model/`."""
     preset: Literal["tiny", "cpu", "paper"] = "cpu"
     """Where the other options' values come from."""
+    config: Path | None = None
+    """JSON file of options that change the preset's, such as `best.json` of `tune-worldmodel` or `config.json` of
+    another run. Options given here win over both."""
     validation: Path | None = None
     """Dataset to validate on; by default the last tenth of the training episodes is held out."""
     model: ModelName = "t3vip"

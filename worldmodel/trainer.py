@@ -7,7 +7,7 @@ import logging
 import math
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
@@ -29,11 +29,15 @@ from worldmodel.pictures import picture_prediction
 from worldmodel.ranks import ALONE, Ranks
 from worldmodel.rollout import Rollout, unroll
 from worldmodel.t3vip import T3VIP
-from worldmodel.validation import ValidationSet, summary, validate
+from worldmodel.validation import Scores, ValidationSet, summary, validate
 from worldmodel.world_model import WorldModel
 
 logger = logging.getLogger(__name__)
 MAX_BAD_STEPS = 10
+
+
+class Diverged(UsageError):
+    """Training has come to numbers that are none."""
 
 
 class Trainer:
@@ -76,8 +80,12 @@ class Trainer:
         self.step, self.best, self.seconds = 0, -math.inf, 0.0
         self.bad_steps = 0
 
-    def run(self) -> None:
-        """Train to the last step, resuming where the run's folder stands; SIGTERM saves and stops."""
+    def run(self, told: Callable[[Scores], None] = lambda scores: None) -> None:
+        """Train to the last step, resuming where the run's folder stands; SIGTERM saves and stops.
+
+        Args:
+            told: is called with the scores after each validation.
+        """
         options = self.options
         state = load_training(options.out, self.modules, self.optimiser)
         if state is not None:
@@ -109,7 +117,9 @@ class Trainer:
                     share = waited / max(time.monotonic() - started, 1e-9)
                     self._log(writer, "train", terms | {"seconds": self.seconds, "data_wait": share})
                 if writer and (self.step % options.validate_every == 0 or last):
-                    bar.write(self.score(writer))
+                    scores = self.score(writer)
+                    bar.write(f"step {self.step}: {summary(scores)}")
+                    told(scores)
                 if writer and (self.step % options.save_every == 0 or last or stop):
                     self.save()
                 if stop:
@@ -133,7 +143,7 @@ class Trainer:
             self.bad_steps += 1
             logger.warning("step %d skipped: %s not finite", self.step, ", ".join(bad))
             if self.bad_steps >= MAX_BAD_STEPS:
-                raise UsageError(
+                raise Diverged(
                     f"the loss was not finite {MAX_BAD_STEPS} steps in a row (terms: {', '.join(bad)}); look for bad "
                     "frames with inspect-dataset, or lower --learning-rate"
                 )
@@ -211,8 +221,8 @@ class Trainer:
         each = len(draws) // self.ranks.count
         return draws[self.ranks.index * each :][:each].to(self.device)
 
-    def score(self, writer: SummaryWriter) -> str:
-        """Validate, draw a picture, and keep the model if it is the best so far; returns a line for people."""
+    def score(self, writer: SummaryWriter) -> Scores:
+        """Validate, draw a picture, and keep the model if it is the best so far."""
         scores = validate(self.model, self.validation)
         self._log(writer, "validation", scores)
         clips, starts = next(self.validation.batches())
@@ -226,7 +236,7 @@ class Trainer:
             self.best = score
             origin = self.origin | {"step": self.step, "seconds": round(self.seconds), "validation": scores}
             save_model(self.model, self.options.out / "model", origin, self.inference)
-        return f"step {self.step}: {summary(scores)}"
+        return scores
 
     def save(self) -> None:
         """Write a checkpoint to go on from."""

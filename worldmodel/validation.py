@@ -58,9 +58,10 @@ def validate(model: WorldModel, data: ValidationSet, still: bool = False) -> Sco
 
     Returns:
         Per predicted step after the context: `psnr`, `copy_psnr` (dB), and of T3VIP `depth_rmse`, `copy_depth_rmse`
-        (metres). Means: `score` (RGB PSNR, of T3VIP plus depth PSNR, in dB: the paper's tuning metric); of T3VIP
-        `inpainted` (share of pixels) and, with ground truth, the terms of `flow_scores`, one step ahead of true frames,
-        and `tracking_error`: how far the moved TCP is off at the end of the clip, over how far it really went.
+        (metres) and `depth_psnr` (dB; its peak is the camera's working range, far less near). Means: `score` (RGB PSNR,
+        of T3VIP plus depth PSNR, in dB: the paper's tuning metric); of T3VIP `inpainted` (share of pixels) and, with
+        ground truth, the terms of `flow_scores`, one step ahead of true frames, and `tracking_error`: how far the moved
+        TCP is off at the end of the clip, over how far it really went.
     """
     was_training = model.training
     model.eval()
@@ -101,6 +102,7 @@ def validate(model: WorldModel, data: ValidationSet, still: bool = False) -> Sco
     scores |= {
         "depth_rmse": depth_rmse.tolist(),
         "copy_depth_rmse": rmse_per_step(all_depth[:, :1].expand_as(all_depth[:, 1:]), all_depth[:, 1:]).tolist(),
+        "depth_psnr": depth_psnr.tolist(),
         "inpainted": float(torch.cat(inpainted).mean()),
         "score": float(psnr.mean() + depth_psnr.mean()),
     }

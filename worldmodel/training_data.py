@@ -1,0 +1,83 @@
+"""What a run trains and validates on: one dataset or two, of one kind, and none that is for testing."""
+
+from __future__ import annotations
+
+from data_collection.dataset import RGBDDataset
+from envs.errors import UsageError
+from worldmodel.clips import ClipSource
+from worldmodel.config import ModelContext
+from worldmodel.options import TrainOptions
+from worldmodel.validation import ValidationSet
+
+TEST_ONLY = "TabletopD-v0"
+"""The unseen scene; training or tuning on it would make every figure about generalisation worthless."""
+TEST_SPLITS = ("test", "all")
+"""Of environments whose objects are split, the splits with objects that are for testing."""
+HELD_OUT = 10
+"""Without a validation set, one episode in so many is held out."""
+
+
+def open_data(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
+    """Clips to train on, and those to validate on.
+
+    Raises:
+        UsageError: there is no such data, it is for testing only, or it is too short or too little for the options.
+    """
+    dataset = RGBDDataset(options.data)
+    for opened in [dataset] + ([RGBDDataset(options.validation)] if options.validation else []):
+        if str(opened.attrs["env_id"]).endswith(TEST_ONLY):
+            raise UsageError(
+                f"{opened.path} comes from {TEST_ONLY}, the test scene; train and validate on scene A, B or C"
+            )
+        if opened.attrs["env_kwargs"].get("split") in TEST_SPLITS:
+            raise UsageError(
+                f"{opened.path} holds objects for testing only; collect with --scene train and --scene validation"
+            )
+    if options.validation is not None:
+        held_out = RGBDDataset(options.validation)
+        _same_world(dataset, held_out)
+        train, other = (
+            ClipSource(opened, options.frame_gap, action_column=options.action_column) for opened in (dataset, held_out)
+        )
+    else:
+        if dataset.episodes < 2:
+            raise UsageError(
+                f"{dataset.path} has {dataset.episodes} episode, none to hold out; collect more, or give --validation"
+            )
+        split = dataset.episodes - max(1, dataset.episodes // HELD_OUT)
+        train = ClipSource(dataset, options.frame_gap, slice(0, split), action_column=options.action_column)
+        other = ClipSource(
+            dataset, options.frame_gap, slice(split, None), share=train, action_column=options.action_column
+        )
+    frames = max(frames for _, frames in options.schedule.clip_lengths)
+    for clips in (train, other):
+        clips.starts(frames)  # now, not hours later, when the curriculum gets there
+    return train, ValidationSet(other, options.validation_clips, frames, options.context, options.batch)
+
+
+def _same_world(train: RGBDDataset, other: RGBDDataset) -> None:
+    for name, ours, theirs in (
+        ("action size", train.action_dim, other.action_dim),
+        ("image size", (train.camera.height, train.camera.width), (other.camera.height, other.camera.width)),
+        ("depth range", (train.camera.near, train.camera.far), (other.camera.near, other.camera.far)),
+    ):
+        if ours != theirs:
+            raise UsageError(f"{other.path} has {name} {theirs}, {train.path} has {ours}; validate on data of one kind")
+
+
+def model_context(train: ClipSource, options: TrainOptions) -> ModelContext:
+    """What the model is made for, as the data says."""
+    attrs = train.dataset.attrs
+    mean, std = train.action_statistics()
+    return ModelContext(
+        env_id=attrs["env_id"],
+        camera=train.dataset.camera.to_json(),
+        action_dim=train.action_dim,
+        frame_gap=options.frame_gap,
+        control_rate=float(attrs["control_rate"]),
+        action_aggregation=train.action_aggregation,
+        action_scale=train.action_scale,
+        action_mean=tuple(float(x) for x in mean),
+        action_std=tuple(float(x) for x in std),
+        action_column=train.action_column,
+    )
