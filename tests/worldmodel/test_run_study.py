@@ -293,3 +293,16 @@ def test_a_study_that_is_killed_leaves_no_trainer_behind_and_goes_on_where_it_wa
     assert again.returncode == 0, err
     assert logged() == list(range(1, steps + 1))  # the trainer saved when its parent died: no step was done twice
     assert "trained: 40 steps" in printed and list(document(out)["models"]) == ["cdna-gap3"]
+
+
+def test_a_config_file_changes_the_options_of_all_models(study, data, tmp_path):
+    config = tmp_path / "weights.json"
+    config.write_text('{"losses": {"depth": 0.2}, "learning_rate": 0.002}')
+    code, _, trained = study("--steps", 2, "--gap", 1, "--only", "cdna", "t3vip", "--config", config)
+    assert (code, trained) == (0, ["cdna-gap1", "t3vip-gap1"])
+    for run_name in trained:
+        options = json.loads((tmp_path / "study" / "models" / run_name / "config.json").read_text())
+        assert (options["losses"]["depth"], options["learning_rate"]) == (0.2, 0.002)
+    report = (tmp_path / "study" / "study.md").read_text()
+    assert '{"losses": {"depth": 0.2}, "learning_rate": 0.002}' in report
+    assert study("--config", tmp_path / "none.json")[0] == 2

@@ -52,6 +52,8 @@ class StudyOptions:
     """Score by VGG too; fetches its weights (60 MB) the first time."""
     preset: Literal["tiny", "cpu", "paper"] = "cpu"
     """Of `train-worldmodel`."""
+    config: Path | None = None
+    """Of `train-worldmodel`: a JSON file of options that change the preset's, the same for all models."""
     seed: int = 0
     """Of training and of the samples."""
     device: str = "auto"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -48,6 +49,7 @@ def _protocol(document: Document) -> list[str]:
     data, settings, budget = document["data"], document["settings"], document["budget"]
     each = f"{budget['minutes']:g} minutes" if "minutes" in budget else f"{budget['steps']} steps"
     machine = document["machine"]
+    changed = f" with {json.dumps(settings['config'])}" if settings["config"] else ""
     samples = "latents at 0"
     if settings["samples"]:
         samples = (
@@ -57,7 +59,7 @@ def _protocol(document: Document) -> list[str]:
     return [
         f"**Ours**: trained on {data['train']['env_id']} ({data['train']['episodes']} episodes) for {each} each, one "
         f"after the other, on {machine['gpu'] or machine['cpu']} ({machine['cores']} cores), preset "
-        f"`{settings['preset']}`, seed {settings['seed']}; the best model on {data['validation']['env_id']} "
+        f"`{settings['preset']}`{changed}, seed {settings['seed']}; the best model on {data['validation']['env_id']} "
         f"({data['validation']['episodes']} other episodes) is tested on {data['test']['env_id']} "
         f"({data['test']['episodes']} episodes, {settings['clips']} clips). {settings['context']} frames seen, "
         f"{settings['horizons'][-1]} predicted, free running; {samples}. Shorter horizons are the first frames of the "

@@ -14,6 +14,7 @@ from safetensors import safe_open
 from data_collection.dataset import RGBDDataset
 from envs.errors import UsageError
 from worldmodel.checkpoint import CONFIG, WEIGHTS, find_model
+from worldmodel.config_file import read_config
 from worldmodel.scores import PICTURE_SCORES, SCORES
 from worldmodel.study.options import StudyOptions
 from worldmodel.study.paper import numbers_of, setting_of
@@ -66,6 +67,7 @@ def collect(options: StudyOptions) -> dict[str, Any]:
         "budget": {"minutes": options.minutes} if options.steps is None else {"steps": options.steps},
         "settings": {
             "preset": options.preset,
+            "config": {} if options.config is None else read_config(options.config),
             "seed": options.seed,
             "context": CONTEXT,
             "horizons": list(options.averaged),

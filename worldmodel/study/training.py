@@ -52,6 +52,7 @@ def arguments_of(options: StudyOptions, contestant: Contestant) -> list[str]:
         "device": options.device,
         "frame-gap": contestant.gap,
     }
+    told |= {} if options.config is None else {"config": options.config}
     told |= {"minutes": options.minutes} if options.steps is None else {"steps": options.steps}
     return [word for name, value in told.items() for word in (f"--{name}", str(value))] + list(contestant.arguments)
 
