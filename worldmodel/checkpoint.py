@@ -210,7 +210,7 @@ def load_training(run: Path, modules: Mapping[str, nn.Module], optimiser: torch.
         }
         if moments:
             optimiser.state[parameter] = {
-                key: value.clone()
+                key: value.to(parameter.device if optimiser.defaults.get("fused") else "cpu", copy=True)
                 if key == "step"
                 else value.to(parameter.device).clone(memory_format=torch.preserve_format)
                 for key, value in moments.items()

@@ -3,29 +3,75 @@
 from __future__ import annotations
 
 import functools
+import importlib.util
 import logging
+import os
 import shutil
 import sys
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 import torch
+from torch import Tensor
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 logger = logging.getLogger(__name__)
+OLDEST_GPU = (7, 0)
+"""Compute capability from which on Triton makes kernels."""
 
 
 @functools.cache
-def can_compile() -> bool:
-    """Whether TorchInductor can build CPU kernels here: it needs a C++ compiler."""
-    if sys.platform == "win32" or not any(shutil.which(name) for name in ("g++", "clang++", "c++")):
-        logger.info("no C++ compiler found: running without torch.compile, which is slower; results are the same")
+def can_compile(device: str = "cpu") -> bool:
+    """Whether TorchInductor can build kernels for a kind of device: it needs a C++ compiler, on a GPU C and Triton."""
+    if sys.platform == "win32":
         return False
-    return True
+    if device == "cpu":
+        missing = "" if _found("CXX", "g++", "clang++", "c++") else "C++ compiler"
+    elif device == "cuda":
+        missing = "" if importlib.util.find_spec("triton") else "Triton"
+        missing = missing or ("" if _found("CC", "gcc", "clang", "cc") else "C compiler")
+        missing = missing or ("" if torch.cuda.get_device_capability() >= OLDEST_GPU else "GPU new enough for Triton")
+    else:
+        missing = f"backend for {device}"
+    if missing:
+        logger.info("no %s found: running without torch.compile, which is slower; results are the same", missing)
+    return not missing
+
+
+def _found(variable: str, *names: str) -> bool:
+    return any(shutil.which(name) for name in (os.environ.get(variable, ""), *names) if name)
 
 
 def compiled(function: Function) -> Function:
-    """Compile a function on its first call, for the shapes it is called with."""
-    if not can_compile():
-        return function
-    return torch.compile(function, dynamic=False)  # type: ignore[return-value]
+    """Compile a function on its first call, for the shapes that it is called with.
+
+    Where there is no compiler for the device of its first tensor, or the compiler fails, the function runs as it is.
+    Called from within another compiled function it becomes a part of that.
+    """
+    fast: Callable[..., Any] | None = None
+    failed = False
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        nonlocal fast, failed
+        if failed or torch.compiler.is_compiling() or not can_compile(_device_of(args)):
+            return function(*args, **kwargs)
+        if fast is None:
+            fast = torch.compile(function, dynamic=False)
+        try:
+            return fast(*args, **kwargs)
+        except RuntimeError as error:
+            from torch._dynamo.exc import BackendCompilerFailed
+
+            if not isinstance(error, BackendCompilerFailed):
+                raise
+            failed = True
+            reason = str(error).strip().splitlines()[0]
+            logger.warning("%s runs without torch.compile, which failed (%s)", function.__name__, reason)
+            return function(*args, **kwargs)
+
+    return call  # type: ignore[return-value]
+
+
+def _device_of(args: tuple[Any, ...]) -> str:
+    return next((argument.device.type for argument in args if isinstance(argument, Tensor)), "cpu")

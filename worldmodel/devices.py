@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import torch
 
 from envs.errors import UsageError
@@ -20,6 +22,24 @@ def find_device(name: str | torch.device) -> torch.device:
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
         raise UsageError(f"device '{name}' is not to be had here ({reason}); give cpu or cuda") from error
+
+
+def prepare_devices(deterministic: bool) -> None:
+    """Set PyTorch up for this process, before it computes anything.
+
+    Shapes hardly ever change here, so that a GPU may try its convolution algorithms once and keep the fastest. Which
+    one that is may differ from run to run.
+
+    Args:
+        deterministic: have the same program on the same machine give the same bits, also on a GPU, at some cost in
+            speed; an operation that cannot do so then raises a RuntimeError.
+    """
+    torch.backends.cudnn.benchmark = not deterministic
+    if deterministic:
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS shares buffers between streams
+        torch.backends.cudnn.deterministic = True
+        torch.use_deterministic_algorithms(True)
+        torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]  # nothing reads it
 
 
 def best_precision(device: torch.device) -> torch.dtype:

@@ -95,7 +95,7 @@ def nearest_in_window(query: Tensor, reference: Tensor, radius: int) -> Tensor:
         own = radius * window + radius
         where = torch.full((batch, height, width), own, dtype=torch.int32, device=query.device)
         for row in range(window):
-            first = torch.tensor(row * window, dtype=torch.int32, device=query.device)
+            first = torch.full((), row * window, dtype=torch.int32, device=query.device)
             rows = padded[:, :, row : row + height].contiguous()
             best, where = _scan_row(query, rows, best, where, first, window)
         where = where.long()

@@ -25,10 +25,50 @@ _BILINEAR, _ZEROS, _ALIGN_CORNERS = 0, 0, True
 
 
 def _scatter(values: Tensor, grid: Tensor) -> Tensor:
+    if _order_matters(values):
+        return _scatter_in_order(values, grid)
     out, _ = torch.ops.aten.grid_sampler_2d_backward(
         values, torch.zeros_like(values), grid, _BILINEAR, _ZEROS, _ALIGN_CORNERS, (True, False)
     )
     return out
+
+
+def _order_matters(values: Tensor) -> bool:
+    """Whether sums must have the same bits in every run, on a device whose threads add in any order."""
+    return values.is_cuda and torch.are_deterministic_algorithms_enabled()
+
+
+def _scatter_in_order(values: Tensor, grid: Tensor) -> Tensor:
+    """`_scatter` by `index_add` of the four corners, which PyTorch has in a deterministic kind for GPUs too."""
+    batch, channels, height, width = values.shape
+    x, y = (0.5 * (side - 1) * (grid[..., axis] + 1) for axis, side in enumerate((width, height)))
+    left, top = x.floor(), y.floor()
+    source = values.permute(0, 2, 3, 1)
+    first = (height * width * torch.arange(batch, device=values.device)).view(-1, 1, 1)
+    out = values.new_zeros((batch * height * width, channels))
+    for column, share in ((left, left + 1 - x), (left + 1, x - left)):
+        for row, part in ((top, top + 1 - y), (top + 1, y - top)):
+            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            index = first + row.clamp(0, height - 1).long() * width + column.clamp(0, width - 1).long()
+            weighted = source * (share * part * inside).unsqueeze(-1)
+            out.index_add_(0, index.flatten(), weighted.reshape(-1, channels))
+    return out.view(batch, height, width, channels).permute(0, 3, 1, 2).contiguous()
+
+
+def _grid_gradient(values: Tensor, gradient: Tensor, grid: Tensor) -> Tensor:
+    """Of `_scatter` with respect to the grid. Each thread writes a place of its own here, yet PyTorch refuses this
+    operator in deterministic mode for what it does with its input's gradient, which is left out."""
+    ordered = _order_matters(values)
+    if ordered:
+        torch.use_deterministic_algorithms(False)
+    try:
+        _, found = torch.ops.aten.grid_sampler_2d_backward(
+            values, gradient, grid, _BILINEAR, _ZEROS, _ALIGN_CORNERS, (False, True)
+        )
+    finally:
+        if ordered:
+            torch.use_deterministic_algorithms(True)
+    return found
 
 
 class _BilinearSplat(torch.autograd.Function):
@@ -43,10 +83,7 @@ class _BilinearSplat(torch.autograd.Function):
         (gradient,) = gradients
         gradient = gradient.contiguous()
         sampled = torch.grid_sampler_2d(gradient, grid, _BILINEAR, _ZEROS, _ALIGN_CORNERS)
-        _, grid_gradient = torch.ops.aten.grid_sampler_2d_backward(
-            values, gradient, grid, _BILINEAR, _ZEROS, _ALIGN_CORNERS, (False, True)
-        )
-        return sampled, grid_gradient
+        return sampled, _grid_gradient(values, gradient, grid)
 
 
 def splat_sum(values: Tensor, pixels: Tensor) -> Tensor:
@@ -67,8 +104,9 @@ def splat_sum(values: Tensor, pixels: Tensor) -> Tensor:
 def _grid(pixels: Tensor) -> Tensor:
     """Pixels as `grid_sample` wants them: (B, H, W, 2) with the picture in [-1, 1]."""
     height, width = pixels.shape[-2:]
-    scale = pixels.new_tensor([2.0 / max(width - 1, 1), 2.0 / max(height - 1, 1)]).view(2, 1, 1)
-    return (pixels * scale - 1.0).clamp(-_FAR_OUTSIDE, _FAR_OUTSIDE).permute(0, 2, 3, 1).contiguous()
+    u, v = pixels.unbind(1)
+    grid = torch.stack((u * (2.0 / max(width - 1, 1)) - 1.0, v * (2.0 / max(height - 1, 1)) - 1.0), dim=-1)
+    return grid.clamp(-_FAR_OUTSIDE, _FAR_OUTSIDE).contiguous()
 
 
 @torch.no_grad()

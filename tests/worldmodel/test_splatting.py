@@ -5,6 +5,7 @@ import itertools
 import pytest
 import torch
 
+from worldmodel import splatting
 from worldmodel.geometry import pixel_grid
 from worldmodel.splatting import splat, splat_sum
 
@@ -55,6 +56,24 @@ def test_splat_sum_is_the_loop(shape):
 def test_gradients_of_splat_sum_in_both_arguments():
     values, pixels = scattered(1, 1, 3, 4)
     assert torch.autograd.gradcheck(splat_sum, (values.requires_grad_(), pixels.requires_grad_()))
+
+
+def test_in_deterministic_mode_it_is_the_same(monkeypatch):
+    """What a GPU does then, on the CPU."""
+    values, pixels = (x.requires_grad_() for x in scattered(2, 2, 5, 4))
+    expected = splat_sum(values, pixels)
+    weights = torch.randn(expected.shape, dtype=expected.dtype, generator=torch.Generator().manual_seed(0))
+    gradients = torch.autograd.grad(expected, (values, pixels), weights)
+    monkeypatch.setattr(splatting, "_order_matters", lambda values: torch.are_deterministic_algorithms_enabled())
+    torch.use_deterministic_algorithms(True)
+    try:
+        ordered = splat_sum(values, pixels)
+        in_order = torch.autograd.grad(ordered, (values, pixels), weights)
+        assert torch.are_deterministic_algorithms_enabled()
+    finally:
+        torch.use_deterministic_algorithms(False)
+    for ours, theirs in zip((ordered, *in_order), (expected, *gradients), strict=True):
+        torch.testing.assert_close(ours, theirs)
 
 
 @pytest.mark.parametrize("mode", ["average", "softmax"])

@@ -1,0 +1,75 @@
+"""Without a compiler, or with one that fails, everything runs as it is."""
+
+import logging
+
+import pytest
+import torch
+from torch._dynamo.exc import BackendCompilerFailed
+
+from worldmodel import compilation
+from worldmodel.compilation import can_compile, compiled
+
+
+@pytest.fixture(autouse=True)
+def fresh():
+    can_compile.cache_clear()
+    yield
+    can_compile.cache_clear()
+
+
+class Failed(BackendCompilerFailed):
+    """What PyTorch raises, whose arguments differ from version to version."""
+
+    def __init__(self, reason):
+        RuntimeError.__init__(self, reason)
+
+
+def double(x):
+    """Doubles."""
+    if x.isnan().any():
+        raise RuntimeError("not a number")
+    return 2 * x
+
+
+def test_without_a_compiler_it_is_the_plain_function(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setattr(torch, "compile", lambda *args, **kwargs: pytest.fail("there is nothing to compile with"))
+    assert not can_compile() and not can_compile("cuda") and not can_compile("mps")
+    function = compiled(double)
+    assert function.__doc__ == "Doubles." and function(torch.ones(2)).tolist() == [2, 2]
+
+
+def test_a_compiler_that_fails_is_named_once_and_not_asked_again(monkeypatch, caplog):
+    asked = []
+
+    def broken(function, dynamic):
+        def call(x):
+            asked.append(x)
+            raise Failed("no space left on device")
+
+        return call
+
+    monkeypatch.setattr(torch, "compile", broken)
+    monkeypatch.setattr(compilation, "can_compile", lambda device: True)
+    function = compiled(double)
+    with caplog.at_level(logging.WARNING):
+        assert function(torch.ones(2)).tolist() == [2, 2] and function(torch.ones(3)).tolist() == [2, 2, 2]
+    assert len(asked) == 1 and len(caplog.records) == 1
+    assert "double runs without torch.compile" in caplog.text and "no space left" in caplog.text
+
+
+def test_errors_of_the_function_itself_are_its_own(monkeypatch):
+    monkeypatch.setattr(torch, "compile", lambda function, dynamic: function)
+    monkeypatch.setattr(compilation, "can_compile", lambda device: True)
+    with pytest.raises(RuntimeError, match="not a number"):
+        compiled(double)(torch.tensor([torch.nan]))
+
+
+def test_the_device_decides(monkeypatch):
+    asked = []
+    monkeypatch.setattr(compilation, "can_compile", lambda device: bool(asked.append(device)))
+    function = compiled(lambda count, x: x * count)
+    assert function(2, torch.ones(1)).tolist() == [2]
+    assert function(2, torch.ones(1, device="meta")).device.type == "meta"
+    assert asked == ["cpu", "meta"]
