@@ -22,7 +22,9 @@ from envs.errors import UsageError
 
 ACTION_COLUMNS = ("action", "joint_delta")
 """What a model may be conditioned on: what was commanded, or how far each joint went, which tells of the outcome."""
-PICTURES = ("rgb", "depth", "segmentation")
+HELD = ("rgb", "depth")
+"""What is held in memory where it fits."""
+PICTURES = (*HELD, "segmentation")
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,10 @@ class Clips:
     """(B, T, 1, H, W) float32 metres."""
     actions: Tensor
     """(B, T-1, A) float32, aggregated over the frame gap, in the dataset's units."""
+
+    def pinned(self) -> Clips:
+        """The same in memory that a GPU reads by itself, so that copying it need not be waited for."""
+        return Clips(*(getattr(self, field.name).pin_memory() for field in fields(self)))
 
     def to(self, device: torch.device) -> Clips:
         """The same on another device."""
@@ -83,11 +89,11 @@ class ClipSource:
         self.dataset, self.frame_gap, self.action_column = dataset, frame_gap, action_column
         self._slices = dataset.episode_slices[episodes or slice(None)]
         self._columns: dict[str, NDArray[Any]] = share._columns if share else {}
-        self.in_memory: bool = memory_limit is None or dataset.size_of(("rgb", "depth")) <= memory_limit
+        self.in_memory: bool = memory_limit is None or dataset.size_of(HELD) <= memory_limit
         """Whether pictures are held; what `share` decided holds here too."""
         if share is not None:
             self.in_memory = share.in_memory
-        self._hold((action_column, "rgb", "depth") if self.in_memory else (action_column,))
+        self._hold((action_column, *HELD) if self.in_memory else (action_column,))
         self.action_dim = int(self._columns[action_column].shape[1])
         self.action_aggregation: tuple[str, ...] = ("sum",) * self.action_dim  # of joint deltas, in radians
         self.action_scale: tuple[float, ...] = (1.0,) * self.action_dim
@@ -129,7 +135,7 @@ class ClipSource:
 
     def at(self, starts: NDArray[np.int64], frames: int) -> Clips:
         """The clips that start at these rows."""
-        stored = self._read(("rgb", "depth"), self._rows(starts, frames))
+        stored = self._read(HELD, self._rows(starts, frames))
         rgb = torch.from_numpy(stored["rgb"]).permute(0, 1, 4, 2, 3).float() / 255
         depth = torch.from_numpy(self.dataset.depth_metres(stored["depth"])).unsqueeze(2)
         return Clips(rgb, depth, torch.from_numpy(self.actions_at(starts, frames)))

@@ -97,6 +97,11 @@ class TrainOptions:
     """What the network runs in; geometry, splatting and losses always run in float32."""
     device: str = "auto"
     """`cpu`, `cuda`, or `auto` for a GPU where there is one."""
+    deterministic: bool = False
+    """Have the same run give the same bits on the same machine, also on a GPU, at some cost in speed there."""
+    memory_limit: float | None = None
+    """GB that the pictures of the datasets may take in memory; larger ones are read from the disk as they are needed.
+    By default half of what is free, shared by the processes of torchrun."""
     validate_every: int = 2000
     """Steps from one validation, with pictures, to the next."""
     validation_clips: int = 64
@@ -112,6 +117,8 @@ class TrainOptions:
                 raise UsageError(f"{name.replace('_', '-')} is {getattr(self, name)}; give at least 1")
         if self.minutes is not None and not self.minutes > 0:
             raise UsageError(f"minutes is {self.minutes}; give a positive number such as 20, or --steps instead")
+        if self.memory_limit is not None and not self.memory_limit >= 0:
+            raise UsageError(f"memory-limit is {self.memory_limit}; give GB, or 0 to read everything from the disk")
         if self.learning_rate <= 0:
             raise UsageError(f"learning-rate is {self.learning_rate}; give a positive number such as 1e-3")
         shortest = min(frames for _, frames in self.schedule.clip_lengths)

@@ -111,6 +111,11 @@ class Ranks:
 ALONE = Ranks()
 
 
+def processes_here() -> int:
+    """How many processes torchrun started on this machine."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+
+
 @contextmanager
 def join_ranks(device: str) -> Iterator[Ranks]:
     """Meet the other processes that `torchrun` started; without it there are none.

@@ -16,6 +16,7 @@ from envs.errors import UsageError
 from worldmodel.budget import Cost, measure_cost
 from worldmodel.clips import ClipSource
 from worldmodel.config_file import changed, read_config
+from worldmodel.devices import prepare_devices
 from worldmodel.memory import keep_freed_memory
 from worldmodel.models import make_model, named_config
 from worldmodel.options import PRESETS, TrainOptions
@@ -24,10 +25,14 @@ from worldmodel.trainer import Trainer
 from worldmodel.training_data import model_context, open_data
 from worldmodel.validation import ValidationSet
 
+HOW_NOT_WHAT = ("device", "deterministic", "memory_limit")
+"""Options that a run may go on with others of."""
+
 
 def main(options: TrainOptions) -> None:
     """Train, with all processes that torchrun started."""
     keep_freed_memory()
+    prepare_devices(options.deterministic)
     with join_ranks(options.device) as ranks:
         _train(options, ranks)
 
@@ -99,7 +104,7 @@ def existing_run(options: TrainOptions) -> TrainOptions | None:
         raise UsageError(f"{path} is damaged ({error}); restore it, or give another --out") from error
     document = document_of(options)
     for name in document:
-        if name != "device" and before.get(name) != document[name]:
+        if name not in HOW_NOT_WHAT and before.get(name) != document[name]:
             raise UsageError(
                 f"{options.out} holds a run with {name} = {before.get(name)}, not {document[name]}; give the same "
                 "options to go on with it, or another --out"

@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from envs.errors import UsageError
 from worldmodel import losses
+from worldmodel.ahead import Ahead
 from worldmodel.checkpoint import load_training, save_model, save_training
 from worldmodel.clips import Clips, ClipSource
 from worldmodel.colour_jitter import ColourJitter
@@ -77,6 +78,9 @@ class Trainer:
         parameters = [p for module in self.modules.values() for p in module.parameters()]
         self.parameters = parameters
         self.optimiser = torch.optim.Adam(parameters, lr=options.learning_rate, fused=self.device.type == "cuda")
+        self._draw_ahead: Callable[[int], tuple[Clips, ColourJitter | None]] = self._draw
+        if self.device.type == "cuda" or not train.in_memory:
+            self._draw_ahead = Ahead(self._draw, options.steps)
         self.step, self.best, self.seconds = 0, -math.inf, 0.0
         self.bad_steps = 0
 
@@ -194,12 +198,20 @@ class Trainer:
 
     def next_clips(self) -> Clips:
         """This rank's clips of this step."""
-        rng = np.random.default_rng((self.options.seed, self.step))
-        frames = self.options.schedule.clip_length(self.progress)
-        clips = self.train_clips.sample(rng, self.options.batch, frames, self.share).to(self.device)
-        if self.options.colour_jitter <= 0:
-            return clips
-        return ColourJitter.draw(self.options.batch, self.options.colour_jitter, rng).share(self.share).apply(clips)
+        clips, jitter = self._draw_ahead(self.step)
+        clips = clips.to(self.device)
+        return clips if jitter is None else jitter.apply(clips)
+
+    def _draw(self, step: int) -> tuple[Clips, ColourJitter | None]:
+        """This rank's clips of a step as they are stored, and what becomes of their colours; by seed and step alone."""
+        options = self.options
+        rng = np.random.default_rng((options.seed, step))
+        frames = options.schedule.clip_length(step / options.steps)
+        clips = self.train_clips.sample(rng, options.batch, frames, self.share)
+        clips = clips.pinned() if self.device.type == "cuda" else clips
+        if options.colour_jitter <= 0:
+            return clips, None
+        return clips, ColourJitter.draw(options.batch, options.colour_jitter, rng).share(self.share)
 
     def _latents(self, clips: Clips, noise: torch.Generator) -> tuple[Tensor | None, Tensor | None]:
         if self.inference is None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from data_collection.dataset import RGBDDataset
 from envs.errors import UsageError
-from worldmodel.clips import ClipSource
+from worldmodel.clips import HELD, ClipSource
 from worldmodel.config import ModelContext
+from worldmodel.memory import available_memory
 from worldmodel.options import TrainOptions
+from worldmodel.ranks import processes_here
 from worldmodel.validation import ValidationSet
 
 TEST_ONLY = "TabletopD-v0"
@@ -15,6 +17,8 @@ TEST_SPLITS = ("test", "all")
 """Of environments whose objects are split, the splits with objects that are for testing."""
 HELD_OUT = 10
 """Without a validation set, one episode in so many is held out."""
+FREE_SHARE = 0.5
+"""Of the memory that is free, what datasets may take; training takes some, too."""
 
 
 def open_data(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
@@ -33,19 +37,22 @@ def open_data(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
             raise UsageError(
                 f"{opened.path} holds objects for testing only; collect with --scene train and --scene validation"
             )
+    limit = _memory_limit(options)
     if options.validation is not None:
         held_out = RGBDDataset(options.validation)
         _same_world(dataset, held_out)
-        train, other = (
-            ClipSource(opened, options.frame_gap, action_column=options.action_column) for opened in (dataset, held_out)
-        )
+        train = ClipSource(dataset, options.frame_gap, action_column=options.action_column, memory_limit=limit)
+        limit -= dataset.size_of(HELD) if train.in_memory else 0
+        other = ClipSource(held_out, options.frame_gap, action_column=options.action_column, memory_limit=limit)
     else:
         if dataset.episodes < 2:
             raise UsageError(
                 f"{dataset.path} has {dataset.episodes} episode, none to hold out; collect more, or give --validation"
             )
         split = dataset.episodes - max(1, dataset.episodes // HELD_OUT)
-        train = ClipSource(dataset, options.frame_gap, slice(0, split), action_column=options.action_column)
+        train = ClipSource(
+            dataset, options.frame_gap, slice(0, split), action_column=options.action_column, memory_limit=limit
+        )
         other = ClipSource(
             dataset, options.frame_gap, slice(split, None), share=train, action_column=options.action_column
         )
@@ -53,6 +60,13 @@ def open_data(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
     for clips in (train, other):
         clips.starts(frames)  # now, not hours later, when the curriculum gets there
     return train, ValidationSet(other, options.validation_clips, frames, options.context, options.batch)
+
+
+def _memory_limit(options: TrainOptions) -> float:
+    """Bytes that the pictures of all datasets may take in this process."""
+    if options.memory_limit is not None:
+        return 1e9 * options.memory_limit
+    return FREE_SHARE * available_memory() / processes_here()
 
 
 def _same_world(train: RGBDDataset, other: RGBDDataset) -> None:

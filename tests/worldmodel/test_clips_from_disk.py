@@ -1,16 +1,21 @@
 """A dataset that does not fit: the same clips, of which only what they need is read."""
 
 import io
+import math
 
 import h5py
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from data_collection import dataset as dataset_module
 from data_collection import writer
 from data_collection.dataset import NEARBY_ROWS, RGBDDataset
+from envs.errors import UsageError
 from worldmodel.clips import ClipSource
+from worldmodel.memory import available_memory
+from worldmodel.train import main, parse_options
 
 FRAMES, GAP, ROWS_A_CHUNK = 3, 2, 5
 ROWS = 2 * NEARBY_ROWS + 40
@@ -105,3 +110,27 @@ def test_rows_that_are_not_there(sources):
     for row in (-1, 4 * ROWS):
         with pytest.raises(IndexError, match=f"of a dataset of {4 * ROWS}"):
             dataset.rows(("rgb",), np.array([row]))
+
+
+def test_training_has_the_same_bits_from_the_disk_and_when_it_must(folder, tmp_path):
+    given = ["--preset", "tiny", "--data", str(folder), "--steps", "3", "--batch", "2"]
+    try:
+        main(parse_options([*given, "--out", str(tmp_path / "memory"), "--deterministic"]))
+        assert torch.are_deterministic_algorithms_enabled() and not torch.backends.cudnn.benchmark
+    finally:
+        torch.use_deterministic_algorithms(False)
+        torch.backends.cudnn.deterministic = False
+    main(parse_options([*given, "--out", str(tmp_path / "disk"), "--memory-limit", "0"]))
+    held, read = (
+        load_file(tmp_path / run / "checkpoints/step-00000003/training.safetensors") for run in ("memory", "disk")
+    )
+    assert held.keys() == read.keys()
+    for name, value in held.items():
+        assert torch.equal(value, read[name]), name
+    main(parse_options([*given, "--out", str(tmp_path / "disk")]))  # it would go on without the limit
+
+
+def test_a_limit_that_is_none():
+    with pytest.raises(UsageError, match="memory-limit is -1"):
+        parse_options(["--data", "data", "--out", "out", "--memory-limit", "-1"])
+    assert 0 < available_memory() < math.inf
