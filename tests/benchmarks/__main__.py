@@ -14,7 +14,8 @@ from envs.command import run
 from envs.errors import UsageError
 from tests.benchmarks.child import BenchmarkFailed
 from tests.benchmarks.machine import facts
-from tests.benchmarks.result import table
+from tests.benchmarks.result import Result, table
+from tests.benchmarks.series import SERIES
 from tests.benchmarks.suite import BENCHMARKS
 
 
@@ -29,7 +30,7 @@ class BenchConfig:
     out: Path = Path("build/bench.json")
     """Where the results go."""
     only: tuple[str, ...] = ()
-    """Names of the benchmarks to run; all when not given."""
+    """Names of the benchmarks to run; all when not given, but for series, which are long."""
     quick: bool = False
     """Tiny sizes, to see whether everything runs; the numbers mean nothing."""
     list: bool = False
@@ -37,23 +38,24 @@ class BenchConfig:
 
     def __post_init__(self) -> None:
         for name in self.only:
-            if name not in BENCHMARKS:
-                raise UsageError(f"no benchmark '{name}'; there are {', '.join(BENCHMARKS)}")
+            if name not in (*BENCHMARKS, *SERIES):
+                raise UsageError(f"no benchmark '{name}'; there are {', '.join((*BENCHMARKS, *SERIES))}")
 
 
 def main(config: BenchConfig) -> None:
     """Run them one after the other; exit code 1 when one failed."""
     if config.list:
-        for name, benchmark in BENCHMARKS.items():
+        for name, benchmark in (BENCHMARKS | SERIES).items():
             print(f"{name:<20} {benchmark.__doc__}")
         return
     machine: dict[str, Any] = facts() | {"quick": config.quick, "seconds": {}}
-    results, failed = [], []
+    results: list[Result] = []
+    failed: list[str] = []
     for name in config.only or BENCHMARKS:
         print(f"{name} ...", file=sys.stderr, flush=True)
         start = time.monotonic()
         try:
-            results.append(BENCHMARKS[name](config.quick))
+            results += SERIES[name](config.quick) if name in SERIES else [BENCHMARKS[name](config.quick)]
         except BenchmarkFailed as failure:
             failed.append(name)
             print(f"{name} failed: {failure}", file=sys.stderr)

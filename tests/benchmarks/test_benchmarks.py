@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from tests.benchmarks import plain
+from tests.benchmarks.subjects import scaling
 from tests.benchmarks.subjects.losses import clouds
 from tests.benchmarks.subjects.training import make_trainer
 from worldmodel import geometry, losses, splatting
@@ -32,7 +33,7 @@ def test_list_names_what_others_build_on():
     listed = bench("--list")
     names = {line.split()[0] for line in listed.stdout.splitlines()}
     assert listed.returncode == 0
-    assert names >= {"tabletop_rgbd_steps", "rgbd_frames", "train_step", "knn_loss", "plan_action"}
+    assert names >= {"scaling", "tabletop_rgbd_steps", "rgbd_frames", "train_step", "knn_loss", "plan_action"}
 
 
 def test_quick_run_writes_results_and_machine(tmp_path):
@@ -44,6 +45,17 @@ def test_quick_run_writes_results_and_machine(tmp_path):
     assert result["value"] > 0 and result["ratio"] > 0 and "splat" in ran.stdout
     machine = json.loads((tmp_path / "new" / "bench-machine.json").read_text())
     assert machine["cores"] >= 1 and machine["quick"] and machine["versions"]["torch"]
+
+
+def test_what_a_step_must_take_at_least():
+    options = {"preset": "tiny", "width": 0.25, "precision": "float32", "repeats": 1}
+    one, two = (scaling.step(batch=batch, frames=4, **options) for batch in (1, 2))
+    assert two["gflop"] == pytest.approx(2 * one["gflop"], rel=0.01)  # FLOPs are of the clips
+    assert 1.5 * one["gb_least"] < two["gb_least"] < 2 * one["gb_least"]  # weights are read once
+    assert one["gb_least"] < one["gb_all"] and one["seconds"] > 0
+    shares = scaling.shares(batch=1, frames=4, **options)
+    assert sum(shares.values()) == pytest.approx(1) and shares["convolutions, backward"] > 0
+    assert shares["splatting"] > 0 and shares["other"] < 0.8
 
 
 def test_unknown_benchmark_is_one_line():

@@ -1,0 +1,71 @@
+"""Measurements of many sizes, which take long and compare with no other program: they run only when they are named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from tests.benchmarks.child import measure
+from tests.benchmarks.result import Result, cost
+from worldmodel.options import PRESETS
+
+Point = dict[str, Any]
+SIZES: dict[str, tuple[Any, ...]] = {
+    "batch": (4, 8, 16, 32),
+    "width": (0.25, 0.5, 1.0),
+    "frames": (4, 8, 12, 20),
+    "precision": ("bfloat16", "float32"),
+}
+"""What is varied, one at a time, about the `cpu` preset at the end of its curriculum."""
+
+
+def scaling(quick: bool) -> list[Result]:
+    """Seconds of a training step over batch, width, clip length and precision, against the floor from arithmetic."""
+    preset = "tiny" if quick else "cpu"
+    size: Point = (
+        {"size": 64, "megabytes": 1, "repeats": 1} if quick else {"size": 2048, "megabytes": 256, "repeats": 9}
+    )
+    peaks = measure("scaling.peaks", **size)
+    results = [
+        Result(f"peak_{name}", value, "GB/s" if name == "copy" else "GFLOP/s", "what these cores can do", 1.0)
+        for name, value in peaks.items()
+    ]
+    for name, point in _points(preset, quick).items():
+        found = measure("scaling.step", preset=preset, repeats=1 if quick else 5, **point)
+        arithmetic, traffic = found["gflop"] / peaks[point["precision"]], found["gb_least"] / peaks["copy"]
+        what = (
+            f"the floor: {found['gflop']:.4g} GFLOP take {arithmetic:.3g} s at the peak, operands of convolutions and "
+            f"matrix products ({found['gb_least']:.3g} GB) {traffic:.3g} s; unfused, all operators move "
+            f"{found['gb_all']:.3g} GB"
+        )
+        results.append(cost(name, found["seconds"], "s", max(arithmetic, traffic), what))
+    base = _base(preset)
+    for name, share in measure("scaling.shares", preset=preset, repeats=1 if quick else 3, **base).items():
+        results.append(Result(f"time: {name}", 100 * share, "%", "of the operators' own time in a step", 1.0))
+    return results
+
+
+def _base(preset: str) -> Point:
+    options = PRESETS[preset]
+    frames = options.schedule.clip_lengths[-1][1]
+    return {
+        "batch": options.batch,
+        "width": options.architecture.width,
+        "frames": frames,
+        "precision": options.precision,
+    }
+
+
+def _points(preset: str, quick: bool) -> dict[str, Point]:
+    """Name -> sizes; no point twice."""
+    points: dict[str, Point] = {}
+    for axis, values in SIZES.items():
+        for value in values[:1] if quick else values:
+            point = {**_base(preset), axis: value}
+            if point not in points.values():
+                sizes = "batch {batch}, width {width:g}, {frames} frames, {precision}".format(**point)
+                points[f"step: {sizes}"] = point
+    return points
+
+
+SERIES: dict[str, Callable[[bool], list[Result]]] = {"scaling": scaling}
