@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from envs.errors import UsageError
+from envs.actions import clip_action
 
 ACTUATORS, JOINTS = 20, 24  # the last two joints of each of four fingers are coupled by a tendon
 ACTION_AGGREGATION = ("last",) * ACTUATORS
@@ -22,12 +22,7 @@ def check_action(action: ArrayLike) -> NDArray[np.float64]:
     Raises:
         UsageError: it does not have 20 finite numbers.
     """
-    checked = np.asarray(action, np.float64)
-    if checked.shape != (ACTUATORS,):
-        raise UsageError(f"the action has shape {checked.shape}; give {ACTUATORS} numbers, one for each actuator")
-    if not np.isfinite(checked).all():
-        raise UsageError(f"the action {checked.tolist()} is not finite; give numbers in [-1, 1]")
-    return np.clip(checked, -1.0, 1.0)
+    return clip_action(action, ACTUATORS, "one for each actuator")
 
 
 def joint_targets(model: mujoco.MjModel, actions: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,21 +9,17 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from envs.camera import CameraModel
+from envs.base import RENDER_MODES, RGBDEnv
 from envs.dexhand import control, goals, placement
 from envs.dexhand.scene import CONTROL_RATE, DEPTH_RANGES, FOR_PEOPLE, SUBSTEPS, build_model
 from envs.errors import UsageError
-from envs.rendering import VISIBLE_GROUPS, StaticCamera
+from envs.rendering import VISIBLE_GROUPS
 
-INTEGRATION_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-RENDER_MODES = ("rgb_array", "depth_array", "rgbd_tuple")
 REWARDS = ("sparse", "dense")
-RESET_OPTIONS = ("hand", "cube", "goal")
-OWN_STATE = 2  # seed of the goals, goals so far
 SHOWN_GOAL_OFFSET = (0.0, 0.0, 0.11)  # m, from the goal to where people see it, above the hand
 
 
-class DexHandEnv(gymnasium.Env):
+class DexHandEnv(RGBDEnv):
     """A Shadow Hand, palm up, turns a cube towards a goal pose. A dropped cube terminates the episode.
 
     Observation: `rgb` (H, W, 3) uint8, `depth` (H, W) float32 metres, `proprio` (24,) float32 joint angles, rad;
@@ -45,6 +41,9 @@ class DexHandEnv(gymnasium.Env):
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": CONTROL_RATE}  # noqa: RUF012
+    DEPTH_RANGES = DEPTH_RANGES
+    RESET_OPTIONS = ("hand", "cube", "goal")
+    OWN_STATE = 2  # seed of the goals, goals so far
     ACTION_AGGREGATION = control.ACTION_AGGREGATION
     control_rate = CONTROL_RATE
 
@@ -58,26 +57,19 @@ class DexHandEnv(gymnasium.Env):
         render_mode: str | None = "rgb_array",
         images: bool = True,
     ) -> None:
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise UsageError(f"render_mode is {render_mode!r}; choose one of {', '.join(RENDER_MODES)}")
         if reward_type not in REWARDS:
             raise UsageError(f"reward_type is {reward_type!r}; choose one of {', '.join(REWARDS)}")
         if not 0 < goal_angle <= 180:
             raise UsageError(f"goal_angle is {goal_angle!r}; give degrees above 0, up to 180")
         self.goal_angle, self.new_goals, self.reward_type = float(goal_angle), bool(new_goals), reward_type
-        self.render_mode, self.images = render_mode, images
-        self.mj_model = build_model()
-        self.mj_data = mujoco.MjData(self.mj_model)
+        lengths = {"proprio": control.JOINTS, "observation": 2 * control.JOINTS + 6 + 7}
+        lengths |= {"achieved_goal": 7, "desired_goal": 7}
+        spaces = {name: gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float32) for name, n in lengths.items()}
+        super().__init__(build_model(), control.ACTUATORS, spaces, image_size, supersample, render_mode, images)
         self.ACTION_SCALE = control.action_scale(self.mj_model)
         self._scratch: mujoco.MjData | None = None
         self._index_model()
         self._goal_seed, self._goals_reached = 0, 0
-        self._supersample = supersample
-        self._cameras: dict[tuple[str, int], StaticCamera] = {}
-        self._camera = self._make_camera("static", image_size)
-        self._picture: tuple[NDArray[np.uint8], NDArray[np.float32]] | None = None
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (control.ACTUATORS,), np.float32)
-        self.observation_space = self._make_observation_space()
 
     # --- Gymnasium -------------------------------------------------------------------------------------------------
 
@@ -93,10 +85,7 @@ class DexHandEnv(gymnasium.Env):
             UsageError: an unknown option, or a value that does not fit.
         """
         super().reset(seed=seed)
-        options = options or {}
-        unknown = sorted(set(options) - set(RESET_OPTIONS))
-        if unknown:
-            raise UsageError(f"unknown reset options {unknown}; there are {', '.join(RESET_OPTIONS)}")
+        options = self._check_options(options)
         placement.start(self.mj_model, self.mj_data, self.cube_qpos, options, self.np_random)
         self._goal_seed, self._goals_reached = int(self.np_random.integers(2**31)), 0
         if "goal" in options:
@@ -130,24 +119,7 @@ class DexHandEnv(gymnasium.Env):
         """
         return goals.reward(achieved_goal, desired_goal, self.reward_type == "dense")
 
-    def render(self):
-        """The picture of the static camera, in the way that `render_mode` says."""
-        if self.render_mode is None:
-            return None
-        rgb, depth = self._look()
-        return {"rgb_array": rgb, "depth_array": depth, "rgbd_tuple": (rgb, depth)}[self.render_mode]
-
-    def close(self) -> None:
-        """Give the OpenGL contexts back."""
-        for camera in self._cameras.values():
-            camera.close()
-
     # --- What others build on --------------------------------------------------------------------------------------
-
-    @property
-    def camera(self) -> CameraModel:
-        """Intrinsics, pose and depth range of the static camera."""
-        return self._camera.geometry
 
     @property
     def joint_angles(self) -> NDArray[np.float64]:
@@ -170,81 +142,11 @@ class DexHandEnv(gymnasium.Env):
         return control.actions_of(self.mj_model, self.mj_data.ctrl)
 
     @property
-    def body_names(self) -> list[str]:
-        """Names of the bodies, in the order of their ids."""
-        return [self.mj_model.body(i).name for i in range(self.mj_model.nbody)]
-
-    @property
     def hand_body_ids(self) -> tuple[int, ...]:
         """Bodies of the hand, from the wrist to the fingertips."""
         parts = range(1, self.mj_model.nbody)
         robot = [i for i in parts if self.mj_model.body(i).name.startswith("robot0:")]
         return tuple(i for i in robot if self.mj_model.body(i).name not in ("robot0:hand mount", "robot0:forearm"))
-
-    def observation(self) -> dict[str, NDArray]:
-        """The current observation."""
-        data = self.mj_data
-        joints, pose = data.qpos[self.hand_qpos], data.qpos[self.cube_qpos]
-        state = np.concatenate([joints, data.qvel[self.hand_qvel], data.qvel[self.cube_qvel], pose])
-        observation: dict[str, NDArray] = {
-            "proprio": joints.astype(np.float32),
-            "observation": state.astype(np.float32),
-            "achieved_goal": pose.astype(np.float32),
-            "desired_goal": self.goal.astype(np.float32),
-        }
-        if self.images:
-            rgb, depth = self._look()
-            observation = {"rgb": rgb.copy(), "depth": depth.copy(), **observation}
-        return observation
-
-    def body_poses(self) -> NDArray[np.float64]:
-        """Position and unit quaternion wxyz of every body: (nbody, 7), metres, world frame."""
-        return np.concatenate([self.mj_data.xpos, self.mj_data.xquat], axis=1)
-
-    def segmentation(self) -> NDArray[np.int32]:
-        """The body id under each pixel of the static camera: (H, W)."""
-        return self._camera.segment(self.mj_data)
-
-    def view(self, name: str = "side", size: int = 256) -> NDArray[np.uint8]:
-        """A picture (size, size, 3) from the camera `static` or `side`, for people to look at.
-
-        `side` shows the goal as a second cube that hovers above the hand; `static` shows what a model sees.
-        """
-        if name not in DEPTH_RANGES:
-            raise UsageError(f"there is no view {name!r}; choose one of {', '.join(DEPTH_RANGES)}")
-        data = self.mj_data
-        if name != "static":
-            data = self._scratch = mujoco.MjData(self.mj_model) if self._scratch is None else self._scratch
-            data.qpos[:] = self.mj_data.qpos
-            data.mocap_pos[:] = self.mj_data.mocap_pos + SHOWN_GOAL_OFFSET
-            data.mocap_quat[:] = self.mj_data.mocap_quat
-            mujoco.mj_kinematics(self.mj_model, data)
-            mujoco.mj_camlight(self.mj_model, data)
-        return self._make_camera(name, size).render(data)[0]
-
-    def get_state(self) -> NDArray[np.float64]:
-        """Everything that the future depends on, but the random generator, which only `reset` uses: 1-D float64.
-
-        MuJoCo's integration state, in which the joint targets are controls and the goal is a mocap body; then the seed
-        of the goals and how many were reached.
-        """
-        state = np.empty(mujoco.mj_stateSize(self.mj_model, INTEGRATION_STATE))
-        mujoco.mj_getState(self.mj_model, self.mj_data, state, INTEGRATION_STATE)
-        return np.concatenate([state, [self._goal_seed, self._goals_reached]])
-
-    def set_state(self, state: ArrayLike) -> None:
-        """Go back to a state that `get_state` gave; what follows is the same to the last bit.
-
-        Raises:
-            UsageError: not a state of this environment.
-        """
-        state = np.array(state, np.float64)
-        size = mujoco.mj_stateSize(self.mj_model, INTEGRATION_STATE) + OWN_STATE
-        if state.shape != (size,) or not np.isfinite(state).all():
-            raise UsageError(f"the state has shape {state.shape}; give {size} finite numbers from get_state()")
-        mujoco.mj_setState(self.mj_model, self.mj_data, state[:-OWN_STATE], INTEGRATION_STATE)
-        self._goal_seed, self._goals_reached = (int(number) for number in state[-OWN_STATE:])
-        self._after_physics()
 
     def scene_obs(self) -> NDArray[np.float64]:
         """The pose of the cube, then of the goal: (14,)."""
@@ -260,32 +162,6 @@ class DexHandEnv(gymnasium.Env):
         self.hand_qpos = self.hand_qvel = slice(0, control.JOINTS)
         assert (model.jnt_type[: control.JOINTS] == mujoco.mjtJoint.mjJNT_HINGE).all()
 
-    def _make_observation_space(self) -> gymnasium.spaces.Dict:
-        size, box = self.camera.height, gymnasium.spaces.Box
-
-        def vector(length: int) -> gymnasium.spaces.Box:
-            return box(-np.inf, np.inf, (length,), np.float32)
-
-        spaces: dict[str, gymnasium.Space] = {
-            "proprio": vector(control.JOINTS),
-            "observation": vector(2 * control.JOINTS + 6 + 7),
-            "achieved_goal": vector(7),
-            "desired_goal": vector(7),
-        }
-        if self.images:
-            depth = box(self.camera.near, self.camera.far, (size, size), np.float32)
-            spaces = {"rgb": box(0, 255, (size, size, 3), np.uint8), "depth": depth, **spaces}
-        return gymnasium.spaces.Dict(spaces)
-
-    def _make_camera(self, name: str, size: int) -> StaticCamera:
-        if (name, size) not in self._cameras:
-            near, far = DEPTH_RANGES[name]
-            groups = VISIBLE_GROUPS if name == "static" else (*VISIBLE_GROUPS, FOR_PEOPLE)
-            self._cameras[name, size] = StaticCamera(
-                self.mj_model, name, size, size, near, far, supersample=self._supersample, visible_groups=groups
-            )
-        return self._cameras[name, size]
-
     def _draw_goal(self) -> None:
         """The next goal follows from the episode's seed and its number: a restored state goes on to the same."""
         rng = np.random.default_rng((self._goal_seed, self._goals_reached))
@@ -294,16 +170,37 @@ class DexHandEnv(gymnasium.Env):
     def _set_goal(self, pose: NDArray[np.float64]) -> None:
         self.mj_data.mocap_pos[0], self.mj_data.mocap_quat[0] = pose[:3], pose[3:]
 
-    def _after_physics(self) -> None:
-        """Bring what is seen up to date with the state; leaves the state itself alone."""
-        mujoco.mj_kinematics(self.mj_model, self.mj_data)
-        mujoco.mj_camlight(self.mj_model, self.mj_data)
-        self._picture = None
+    def _measurements(self) -> dict[str, NDArray]:
+        data = self.mj_data
+        joints, pose = data.qpos[self.hand_qpos], data.qpos[self.cube_qpos]
+        state = np.concatenate([joints, data.qvel[self.hand_qvel], data.qvel[self.cube_qvel], pose])
+        return {
+            "proprio": joints.astype(np.float32),
+            "observation": state.astype(np.float32),
+            "achieved_goal": pose.astype(np.float32),
+            "desired_goal": self.goal.astype(np.float32),
+        }
 
-    def _look(self) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        if self._picture is None:
-            self._picture = self._camera.render(self.mj_data)
-        return self._picture
+    def _own_state(self) -> ArrayLike:
+        return [self._goal_seed, self._goals_reached]
+
+    def _set_own_state(self, own: NDArray[np.float64]) -> None:
+        self._goal_seed, self._goals_reached = int(own[0]), int(own[1])
+
+    def _visible_groups(self, camera: str) -> tuple[int, ...]:
+        return VISIBLE_GROUPS if camera == "static" else (*VISIBLE_GROUPS, FOR_PEOPLE)
+
+    def _shown_in(self, view: str) -> mujoco.MjData:
+        """What a model sees in `static`; in `side`, also the goal as a second cube that hovers above the hand."""
+        if view == "static":
+            return self.mj_data
+        data = self._scratch = mujoco.MjData(self.mj_model) if self._scratch is None else self._scratch
+        data.qpos[:] = self.mj_data.qpos
+        data.mocap_pos[:] = self.mj_data.mocap_pos + SHOWN_GOAL_OFFSET
+        data.mocap_quat[:] = self.mj_data.mocap_quat
+        mujoco.mj_kinematics(self.mj_model, data)
+        mujoco.mj_camlight(self.mj_model, data)
+        return data
 
     def _info(self, joint_delta: NDArray[np.float64]) -> dict[str, Any]:
         pose, goal = self.cube_pose, self.goal

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from envs.errors import UsageError
+from envs.actions import clip_action
 from envs.planar_push.scene import CONTROL_RATE
 
 ACTION_SCALE = (0.025, 0.025, float(np.pi))  # m, m, rad
@@ -24,12 +24,7 @@ def check_action(action: ArrayLike) -> Array:
     Raises:
         UsageError: it does not have 3 finite numbers.
     """
-    checked = np.asarray(action, np.float64)
-    if checked.shape != (3,):
-        raise UsageError(f"the action has shape {checked.shape}; give 3 numbers: dx, dy, heading")
-    if not np.isfinite(checked).all():
-        raise UsageError(f"the action {checked.tolist()} is not finite; give numbers in [-1, 1]")
-    return np.clip(checked, -1.0, 1.0)
+    return clip_action(action, 3, "dx, dy, heading")
 
 
 def advance(target: Array, actions: Array, noise: ArrayLike = 0.0) -> Array:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from envs.errors import UsageError
+from envs.actions import clip_action
 from envs.tabletop import rotations
 from envs.tabletop.robot import FINGER_TRAVEL
 from envs.tabletop.scene import CONTROL_RATE
@@ -37,12 +37,7 @@ def check_action(action: ArrayLike) -> Array:
     Raises:
         UsageError: it does not have 7 finite numbers.
     """
-    checked = np.asarray(action, np.float64)
-    if checked.shape != (7,):
-        raise UsageError(f"the action has shape {checked.shape}; give 7 numbers: dx dy dz, turns about x y z, gripper")
-    if not np.isfinite(checked).all():
-        raise UsageError(f"the action {checked.tolist()} is not finite; give numbers in [-1, 1]")
-    return np.clip(checked, -1.0, 1.0)
+    return clip_action(action, 7, "dx dy dz, turns about x y z, gripper")
 
 
 def advance(target: Pose, tcp: Pose, actions: Array) -> Pose:

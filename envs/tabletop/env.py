@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from envs.camera import CameraModel
+from envs.base import RENDER_MODES, RGBDEnv
 from envs.errors import UsageError
-from envs.rendering import StaticCamera
 from envs.tabletop import control, placement, rotations, table
 from envs.tabletop.control import Pose
 from envs.tabletop.kinematics import ArmKinematics
@@ -19,15 +18,10 @@ from envs.tabletop.layouts import layout
 from envs.tabletop.robot import FINGER_JOINTS, FINGER_TRAVEL
 from envs.tabletop.scene import CONTROL_RATE, SIDE_DEPTH_RANGE, STATIC_DEPTH_RANGE, SUBSTEPS, build_model
 
-INTEGRATION_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-RENDER_MODES = ("rgb_array", "depth_array", "rgbd_tuple")
 FIXTURES = ("door", "drawer", "button", "switch")  # CALVIN's order in scene_obs
-HAND_BODIES = ("right_gripper", "leftfinger", "rightfinger", "finger_joint1_tip", "finger_joint2_tip")
-DEPTH_RANGES = {"static": STATIC_DEPTH_RANGE, "side": SIDE_DEPTH_RANGE}  # m
-RESET_OPTIONS = ("arm", "tcp")
 
 
-class TabletopEnv(gymnasium.Env):
+class TabletopEnv(RGBDEnv):
     """A Panda arm at a play table; there is no task: the reward is 0 and nothing terminates.
 
     Observation: `rgb` (H, W, 3) uint8, `depth` (H, W) float32 metres, `proprio` (15,) float32: position of the tool
@@ -45,6 +39,10 @@ class TabletopEnv(gymnasium.Env):
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": CONTROL_RATE}  # noqa: RUF012
+    DEPTH_RANGES: ClassVar[dict[str, tuple[float, float]]] = {"static": STATIC_DEPTH_RANGE, "side": SIDE_DEPTH_RANGE}
+    RESET_OPTIONS = ("arm", "tcp")
+    HAND_BODIES = ("right_gripper", "leftfinger", "rightfinger", "finger_joint1_tip", "finger_joint2_tip")
+    OWN_STATE = 2  # LED, button
     ACTION_AGGREGATION = control.ACTION_AGGREGATION
     ACTION_SCALE = control.ACTION_SCALE
     control_rate = CONTROL_RATE
@@ -57,22 +55,14 @@ class TabletopEnv(gymnasium.Env):
         render_mode: str | None = "rgb_array",
         images: bool = True,
     ) -> None:
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise UsageError(f"render_mode is {render_mode!r}; choose one of {', '.join(RENDER_MODES)}")
-        self.scene, self.render_mode, self.images = scene, render_mode, images
-        self.layout = layout(scene)
-        self.mj_model = build_model(scene)
-        self.mj_data = mujoco.MjData(self.mj_model)
+        bound = np.repeat(np.array([2, 3.15, 0.1, 4, 1], np.float32), [3, 3, 1, 7, 1])  # m, rad, m, rad, sign
+        proprio = gymnasium.spaces.Box(-bound, bound, dtype=np.float32)
+        self.scene, self.layout = scene, layout(scene)
+        super().__init__(build_model(scene), 7, {"proprio": proprio}, image_size, supersample, render_mode, images)
         self.kinematics = ArmKinematics(self.mj_model)
         self.led_on = False
         self._button_down = False
         self._index_model()
-        self._supersample = supersample
-        self._cameras: dict[tuple[str, int], StaticCamera] = {}
-        self._camera = self._make_camera("static", image_size)
-        self._picture: tuple[NDArray[np.uint8], NDArray[np.float32]] | None = None
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), np.float32)
-        self.observation_space = self._make_observation_space()
 
     # --- Gymnasium -------------------------------------------------------------------------------------------------
 
@@ -87,10 +77,7 @@ class TabletopEnv(gymnasium.Env):
             UsageError: an unknown option, or a place that the arm cannot take.
         """
         super().reset(seed=seed)
-        options = options or {}
-        unknown = sorted(set(options) - set(RESET_OPTIONS))
-        if unknown:
-            raise UsageError(f"unknown reset options {unknown}; there are {', '.join(RESET_OPTIONS)}")
+        options = self._check_options(options)
         mujoco.mj_resetData(self.mj_model, self.mj_data)
         rng = self.np_random
         self.led_on, self._button_down = bool(rng.integers(2)), False
@@ -119,24 +106,7 @@ class TabletopEnv(gymnasium.Env):
         self._after_physics()
         return self.observation(), 0.0, False, False, self._info()
 
-    def render(self):
-        """The picture of the static camera, in the way that `render_mode` says."""
-        if self.render_mode is None:
-            return None
-        rgb, depth = self._look()
-        return {"rgb_array": rgb, "depth_array": depth, "rgbd_tuple": (rgb, depth)}[self.render_mode]
-
-    def close(self) -> None:
-        """Give the OpenGL contexts back."""
-        for camera in self._cameras.values():
-            camera.close()
-
     # --- What others build on --------------------------------------------------------------------------------------
-
-    @property
-    def camera(self) -> CameraModel:
-        """Intrinsics, pose and depth range of the static camera."""
-        return self._camera.geometry
 
     @property
     def tcp_position(self) -> NDArray[np.float64]:
@@ -166,63 +136,6 @@ class TabletopEnv(gymnasium.Env):
         """Whether the switch is in its upper half."""
         return bool(self._fixture("switch") > table.SWITCH_TRAVEL / 2)
 
-    @property
-    def body_names(self) -> list[str]:
-        """Names of the bodies, in the order of their ids."""
-        return [self.mj_model.body(i).name for i in range(self.mj_model.nbody)]
-
-    @property
-    def hand_body_ids(self) -> tuple[int, ...]:
-        """Bodies of the end-effector: hand and fingers."""
-        return tuple(self.mj_model.body(name).id for name in HAND_BODIES)
-
-    def observation(self) -> dict[str, NDArray]:
-        """The current observation."""
-        observation: dict[str, NDArray] = {"proprio": self._proprioception()}
-        if self.images:
-            rgb, depth = self._look()
-            observation = {"rgb": rgb.copy(), "depth": depth.copy(), **observation}
-        return observation
-
-    def body_poses(self) -> NDArray[np.float64]:
-        """Position and unit quaternion wxyz of every body: (nbody, 7), metres, world frame."""
-        return np.concatenate([self.mj_data.xpos, self.mj_data.xquat], axis=1)
-
-    def segmentation(self) -> NDArray[np.int32]:
-        """The body id under each pixel of the static camera: (H, W)."""
-        return self._camera.segment(self.mj_data)
-
-    def view(self, name: str = "side", size: int = 256) -> NDArray[np.uint8]:
-        """A picture (size, size, 3) from the camera `static` or `side`, for people to look at."""
-        if name not in DEPTH_RANGES:
-            raise UsageError(f"there is no view {name!r}; choose one of {', '.join(DEPTH_RANGES)}")
-        return self._make_camera(name, size).render(self.mj_data)[0]
-
-    def get_state(self) -> NDArray[np.float64]:
-        """Everything that the future depends on, but the random generator: 1-D float64.
-
-        MuJoCo's integration state, in which the target pose is a body and the gripper command a control, then LED and
-        whether the button is down.
-        """
-        state = np.empty(mujoco.mj_stateSize(self.mj_model, INTEGRATION_STATE))
-        mujoco.mj_getState(self.mj_model, self.mj_data, state, INTEGRATION_STATE)
-        return np.append(state, [self.led_on, self._button_down])
-
-    def set_state(self, state: ArrayLike) -> None:
-        """Go back to a state that `get_state` gave; what follows is the same to the last bit.
-
-        Raises:
-            UsageError: not a state of this environment.
-        """
-        state = np.array(state, np.float64)
-        size = mujoco.mj_stateSize(self.mj_model, INTEGRATION_STATE) + 2
-        if state.shape != (size,) or not np.isfinite(state).all():
-            raise UsageError(f"the state has shape {state.shape}; give {size} finite numbers from get_state()")
-        mujoco.mj_setState(self.mj_model, self.mj_data, state[:-2], INTEGRATION_STATE)
-        self.led_on = bool(state[-2])
-        self._button_down = bool(state[-1])
-        self._after_physics()
-
     def scene_obs(self) -> NDArray[np.float64]:
         """CALVIN's scene observation (24,): fixtures, lamps, then position (m) and Euler angles (rad) of the blocks."""
         blocks = self.mj_data.qpos[self._block_qpos]  # (3, 7)
@@ -243,22 +156,6 @@ class TabletopEnv(gymnasium.Env):
         self._block_qpos = np.array([model.joint(name).qposadr[0] + np.arange(7) for name in table.BLOCKS])
         self._lamps = {name: model.geom(name).id for name in ("led", "bulb")}
 
-    def _make_observation_space(self) -> gymnasium.spaces.Dict:
-        size, box = self.camera.height, gymnasium.spaces.Box
-        bound = np.repeat(np.array([2, 3.15, 0.1, 4, 1], np.float32), [3, 3, 1, 7, 1])  # m, rad, m, rad, sign
-        spaces: dict[str, gymnasium.Space] = {"proprio": box(-bound, bound, dtype=np.float32)}
-        if self.images:
-            depth = box(self.camera.near, self.camera.far, (size, size), np.float32)
-            spaces = {"rgb": box(0, 255, (size, size, 3), np.uint8), "depth": depth, **spaces}
-        return gymnasium.spaces.Dict(spaces)
-
-    def _make_camera(self, name: str, size: int) -> StaticCamera:
-        if (name, size) not in self._cameras:
-            near, far = DEPTH_RANGES[name]
-            camera = StaticCamera(self.mj_model, name, size, size, near, far, supersample=self._supersample)
-            self._cameras[name, size] = camera
-        return self._cameras[name, size]
-
     def _place_arm(self, options: dict[str, Any], rng: np.random.Generator) -> None:
         arm = options.get("arm", "random")
         if arm not in ("random", "rest"):
@@ -278,31 +175,30 @@ class TabletopEnv(gymnasium.Env):
         self.mj_data.ctrl[self.finger_ctrl] = control.finger_targets(command)
 
     def _after_physics(self) -> None:
-        """Bring what is seen up to date with the state; leaves the state itself alone."""
-        mujoco.mj_kinematics(self.mj_model, self.mj_data)
-        mujoco.mj_camlight(self.mj_model, self.mj_data)
+        """As everywhere; then the lamps."""
+        super()._after_physics()
         was_down, self._button_down = self._button_down, self._fixture("button") > table.BUTTON_TRAVEL / 2
         if self._button_down and not was_down:
             self.led_on = not self.led_on
         self.mj_model.geom_rgba[self._lamps["led"]] = table.LED_COLOURS[self.led_on]
         self.mj_model.geom_rgba[self._lamps["bulb"]] = table.BULB_COLOURS[self.bulb_on]
-        self._picture = None
-
-    def _look(self) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        if self._picture is None:
-            self._picture = self._camera.render(self.mj_data)
-        return self._picture
 
     def _fixture(self, name: str) -> float:
         return float(self.mj_data.qpos[self._fixture_qpos[FIXTURES.index(name)]])
 
-    def _proprioception(self) -> NDArray[np.float32]:
+    def _measurements(self) -> dict[str, NDArray]:
         tcp, fingers = self.tcp_pose, self.mj_data.qpos[self._finger_qpos]
         joints = self.mj_data.qpos[self.kinematics.qpos_index]
         last_gripper = 1.0 if self.mj_data.ctrl[self.finger_ctrl[0]] > 0 else -1.0
         width = fingers[0] - fingers[1]
         values = [tcp.position, rotations.to_euler(tcp.quaternion), [width], joints, [last_gripper]]
-        return np.concatenate(values).astype(np.float32)
+        return {"proprio": np.concatenate(values).astype(np.float32)}
+
+    def _own_state(self) -> ArrayLike:
+        return [self.led_on, self._button_down]
+
+    def _set_own_state(self, own: NDArray[np.float64]) -> None:
+        self.led_on, self._button_down = bool(own[0]), bool(own[1])
 
     def _info(self) -> dict[str, Any]:
         return {"scene_obs": self.scene_obs()}
