@@ -1,4 +1,4 @@
-"""Models against each other: over the same setups, and by how much of the way lies along the optical axis.
+"""Models against each other: over the same setups, and by parts of them.
 
 A model of pictures is blind along the optical axis. So the share of the way that lies along it says which setups such
 a model can get right in 3D by reaching the pixel, and which only by chance.
@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from data_collection.files import written_aside
-from planning.episode import THRESHOLDS, Record
-from planning.report import AXIS_BINS, PARTS, aligned, in_part
+from planning.episode import Record
+from planning.report import AXIS_BINS, TITLES, aligned, in_part, parting, parts_of
 from planning.statistics import Pairs
 
 REFERENCE = "t3vip"
@@ -41,13 +42,13 @@ def differences(records: Mapping[str, Sequence[Record]]) -> dict[str, dict[str, 
         records: of each model, of the same setups and repeats in the same order.
 
     Returns:
-        rival -> part of the setups (all, across, along) -> `servo.json`'s entry: the difference of the success rates
+        rival -> part of the setups (all, and both parts) -> `servo.json`'s entry: the difference of the success rates
         with Newcombe's 95 % interval, who alone succeeded how often, and the p-value of McNemar's exact test.
     """
     if REFERENCE not in records:
         return {}
     return {
-        rival: {part: _paired(records[REFERENCE], theirs, part) for part in PARTS}
+        rival: {part: _paired(records[REFERENCE], theirs, part) for part in ("all", *parting(theirs))}
         for rival, theirs in records.items()
         if rival != REFERENCE
     }
@@ -57,7 +58,7 @@ def _paired(ours: Sequence[Record], theirs: Sequence[Record], part: str) -> dict
     couples = [(a, b) for a, b in zip(ours, theirs, strict=True) if in_part(a, part)]
     entry: dict[str, Any] = {"episodes": len(couples)}
     for space in SPACES:
-        pairs = Pairs.count(*([record.success(THRESHOLDS[0], space) for record in side] for side in _unzip(couples)))
+        pairs = Pairs.count(*([record.reached(space) for record in side] for side in _unzip(couples)))
         entry[f"difference_{space}"] = pairs.difference
         entry[f"difference_{space}_interval"] = list(pairs.interval())
         entry[f"only_{REFERENCE}_{space}"], entry[f"only_rival_{space}"] = pairs.first, pairs.second
@@ -88,7 +89,9 @@ def difference_table(entries: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def comparison_chart(models: Mapping[str, Mapping[str, Any]], path: Path, title: str) -> None:
-    """Draw success in 2D and 3D, and both against the share of the way along the optical axis, as a PNG.
+    """Draw success in 2D and 3D, and both by parts of the setups, as a PNG.
+
+    Where the setups differ by the share of the way along the optical axis, both are drawn against that share.
 
     Args:
         models: name -> summary, as in `servo.json`.
@@ -96,28 +99,20 @@ def comparison_chart(models: Mapping[str, Mapping[str, Any]], path: Path, title:
         title: of the first panel.
     """
     figure = Figure(figsize=(11, 3.9), layout="constrained")
-    overall, *by_share = figure.subplots(1, 3, sharey=True, width_ratios=(1.15, 1, 1))
-    for i, (name, entry) in enumerate(models.items()):
-        look = {"color": COLOURS.get(name, "#444444"), "label": name}
-        shares, errors = _bounds([entry, entry], list(SPACES))
-        width = 0.84 / len(models)
-        places = np.arange(len(SPACES)) + (i - (len(models) - 1) / 2) * width
-        overall.bar(places, shares, 0.9 * width, yerr=errors, capsize=2.5, error_kw={"lw": 1}, **look)
-        for axes, space in zip(by_share, SPACES, strict=True):
-            bins = entry["by_axis_bin"]
-            shares, errors = _bounds(bins, [space] * len(bins))
-            places = np.arange(len(bins)) + (i - (len(models) - 1) / 2) * 0.6 / len(models)
-            axes.errorbar(places, shares, errors, fmt="o-", ms=4, lw=1.2, elinewidth=1, capsize=2, **look)
-    overall.set_xticks(range(len(SPACES)), list(SPACES.values()))
+    overall, *beside = figure.subplots(1, 3, sharey=True, width_ratios=(1.15, 1, 1))
+    some = next(iter(models.values()))
+    _draw_bars(overall, {name: [entry, entry] for name, entry in models.items()}, list(SPACES), list(SPACES.values()))
     overall.set_ylabel("success [%]")
     overall.set_title(title, fontsize=10)
-    counts = [part["episodes"] for part in next(iter(models.values()))["by_axis_bin"]]
-    ticks = [f"{low:g}-{high:g}\nn={n}" for low, high, n in zip(AXIS_BINS[:-1], AXIS_BINS[1:], counts, strict=True)]
-    for axes, label in zip(by_share, SPACES.values(), strict=True):
+    for axes, (space, label) in zip(beside, SPACES.items(), strict=True):
+        if "by_axis_bin" in some:
+            _draw_by_share(axes, models, space)
+        else:
+            parts = {name: list(parts_of(entry).values()) for name, entry in models.items()}
+            counts = [f"{TITLES[part]}\nn={entry['episodes']}" for part, entry in parts_of(some).items()]
+            _draw_bars(axes, parts, [space] * 2, counts)
         axes.set_title(label, fontsize=10)
-        axes.set_xticks(range(len(ticks)), ticks, fontsize=8)
-        axes.set_xlabel("share of the way along the optical axis", fontsize=9)
-    for axes in (overall, *by_share):
+    for axes in (overall, *beside):
         axes.set_ylim(0, 105)
         axes.grid(axis="y", alpha=0.3)
         axes.set_axisbelow(True)
@@ -125,6 +120,33 @@ def comparison_chart(models: Mapping[str, Mapping[str, Any]], path: Path, title:
     figure.legend(handles, names, loc="outside lower center", ncols=len(models), frameon=False, fontsize=9)
     with written_aside(path) as aside:
         figure.savefig(aside, format="png", dpi=150)
+
+
+def _draw_bars(
+    axes: Axes, groups: Mapping[str, Sequence[Mapping[str, Any]]], spaces: Sequence[str], labels: Sequence[str]
+) -> None:
+    """A bar for each model in each group: its entries, and in which space they count."""
+    width = 0.84 / len(groups)
+    for i, (name, entries) in enumerate(groups.items()):
+        shares, errors = _bounds(entries, spaces)
+        places = np.arange(len(entries)) + (i - (len(groups) - 1) / 2) * width
+        look = {"color": COLOURS.get(name, "#444444"), "label": name}
+        axes.bar(places, shares, 0.9 * width, yerr=errors, capsize=2.5, error_kw={"lw": 1}, **look)
+    axes.set_xticks(range(len(labels)), labels, fontsize=9)
+
+
+def _draw_by_share(axes: Axes, models: Mapping[str, Mapping[str, Any]], space: str) -> None:
+    """A line for each model against the share of the way along the optical axis."""
+    for i, (name, entry) in enumerate(models.items()):
+        bins = entry["by_axis_bin"]
+        shares, errors = _bounds(bins, [space] * len(bins))
+        places = np.arange(len(bins)) + (i - (len(models) - 1) / 2) * 0.6 / len(models)
+        look = {"color": COLOURS.get(name, "#444444"), "label": name}
+        axes.errorbar(places, shares, errors, fmt="o-", ms=4, lw=1.2, elinewidth=1, capsize=2, **look)
+    counts = [part["episodes"] for part in next(iter(models.values()))["by_axis_bin"]]
+    ticks = [f"{low:g}-{high:g}\nn={n}" for low, high, n in zip(AXIS_BINS[:-1], AXIS_BINS[1:], counts, strict=True)]
+    axes.set_xticks(range(len(ticks)), ticks, fontsize=8)
+    axes.set_xlabel("share of the way along the optical axis", fontsize=9)
 
 
 def _bounds(parts: Sequence[Mapping[str, Any]], spaces: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:

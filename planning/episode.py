@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from statistics import median
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
+from envs.camera import CameraModel
 from planning.controllers.base import Controller
+from planning.marks import Mark, point_position
+from planning.point_setups import TOLERANCES, PointSetup
 from planning.setups import Setup
 
 THRESHOLDS = (0.1, 0.05, 0.025)  # shares of the initial distance; the first is the paper's
@@ -30,7 +34,7 @@ class Record:
     initial_pixel_distance: float
     axis_share: float
     hits_3d: list[int]
-    """control steps within each of THRESHOLDS of the initial distance"""
+    """control steps within each of the limits"""
     hits_2d: list[int]
     final_distance: float
     final_pixel_distance: float
@@ -39,11 +43,19 @@ class Record:
     """median wall time of a decision"""
     distances: list[float]
     """after every control step"""
+    limits: list[float] = field(default_factory=lambda: list(THRESHOLDS))
+    """what counts as near: shares of the initial distance, or, where the setup has a part, metres"""
+    part: str = ""
+    """the part of the setups that this one belongs to, where it is not the way's direction that parts them"""
 
-    def success(self, threshold: float, space: str) -> bool:
-        """Whether the goal counts as reached; `space` is "3d" or "2d"."""
+    def success(self, limit: float, space: str) -> bool:
+        """Whether the goal counts as reached, by one of the limits; `space` is "3d" or "2d"."""
         hits = self.hits_3d if space == "3d" else self.hits_2d
-        return hits[THRESHOLDS.index(threshold)] >= HITS
+        return hits[self.limits.index(limit)] >= HITS
+
+    def reached(self, space: str) -> bool:
+        """Whether the goal counts as reached by the limit that decides."""
+        return self.success(self.limits[0], space)
 
     def to_dict(self) -> dict[str, Any]:
         """The record as JSON knows it."""
@@ -60,34 +72,35 @@ def run_episode(
 ) -> Record:
     """Let a controller servo from a setup.
 
-    The episode ends early only when nothing is left to be found out: when the tightest threshold has been met
-    often enough, in 3D and in the picture.
+    The episode ends early only when nothing is left to be found out: when the tightest limit has been met often enough,
+    in 3D and in the picture.
 
     Args:
-        env: where; its `tcp_position` is the judge, not shown to the controller.
+        env: where; the simulator is the judge, not shown to the controller.
         setup: where it starts and what the goal is.
         controller: sees observations and the goal.
         steps: budget of control steps.
         repeat: number of this attempt at the setup.
         watch: called with the control step at the start and after every step, to film.
     """
-    tabletop: Any = env.unwrapped
-    camera = tabletop.camera
+    inner: Any = env.unwrapped
+    camera = inner.camera
     observation = setup.start(env)
     controller.reset(observation, setup.goal)
     if watch:
         watch(0)
-    limits = np.array(THRESHOLDS)
+    limits, limits_3d, limits_2d = limits_of(setup, camera)
+    mark = mark_of(setup)
     hits_3d, hits_2d = np.zeros(len(limits), int), np.zeros(len(limits), int)
     distances: list[float] = []
     pixel_distance = setup.pixel_distance
     for step in range(steps):
         observation, *_ = env.step(controller.act(observation))
-        tcp = tabletop.tcp_position
-        distances.append(float(np.linalg.norm(tcp - setup.goal.point_world)))
-        pixel_distance = float(np.linalg.norm(camera.project(camera.to_camera(tcp)) - setup.goal.pixel))
-        hits_3d += distances[-1] <= limits * setup.distance
-        hits_2d += pixel_distance <= limits * setup.pixel_distance
+        point = point_position(env, mark)
+        distances.append(float(np.linalg.norm(point - setup.goal.point_world)))
+        pixel_distance = float(np.linalg.norm(camera.project(camera.to_camera(point)) - setup.goal.pixel))
+        hits_3d += distances[-1] <= limits_3d
+        hits_2d += pixel_distance <= limits_2d
         if watch:
             watch(step + 1)
         if min(hits_3d.min(), hits_2d.min()) >= HITS:
@@ -107,4 +120,23 @@ def run_episode(
         least_distance=min(distances),
         plan_seconds=median(controller.plan_seconds),
         distances=[round(d, 5) for d in distances],
+        limits=list(limits),
+        part=setup.part if isinstance(setup, PointSetup) else "",
     )
+
+
+def mark_of(setup: Setup) -> Mark | None:
+    """Where a setup's point truly is; None for the end-effector's."""
+    return setup.mark if isinstance(setup, PointSetup) else None
+
+
+def limits_of(setup: Setup, camera: CameraModel) -> tuple[tuple[float, ...], NDArray, NDArray]:
+    """What counts as near: as it is said, in metres, and in pixels.
+
+    A point on a thing is to come within a distance in metres; in the picture, within what that is at the goal.
+    """
+    if not isinstance(setup, PointSetup):
+        shares = np.array(THRESHOLDS)
+        return THRESHOLDS, shares * setup.distance, shares * setup.pixel_distance
+    metres = np.array(TOLERANCES)
+    return TOLERANCES, metres, metres * camera.K[0, 0] / camera.to_camera(setup.goal.point_world)[2]

@@ -17,14 +17,15 @@ from PIL import Image, ImageDraw, ImageFont
 from data_collection.files import written_aside
 from envs.camera import CameraModel
 from envs.rendering import StaticCamera
-from planning.episode import Record
+from planning.episode import Record, mark_of
+from planning.marks import point_position
 from planning.setups import Setup
 
 SIZE = 256  # pixels of each view
 VIEWS = ("static", "side")
 STRIP_FRAMES = 6
-STEPS_PER_FRAME, FPS = 2, 15  # real time, at 30 control steps a second
-GOAL_COLOUR, TCP_COLOUR = (230, 30, 30), (40, 200, 255)
+MOST_FPS = 15  # pictures a second, in real time
+GOAL_COLOUR, POINT_COLOUR = (230, 30, 30), (40, 200, 255)
 FINE = 4  # lines are drawn this many times larger, then shrunk: smooth edges
 
 
@@ -37,13 +38,14 @@ class Studio:
     """The cameras that films are taken with; made once, for people only.
 
     Args:
-        env: the tabletop environment; it is only looked at.
+        env: the environment; it is only looked at.
     """
 
     def __init__(self, env: gym.Env) -> None:
-        tabletop: Any = env.unwrapped
-        self.tabletop = tabletop
-        model, near, far = tabletop.mj_model, tabletop.camera.near, tabletop.camera.far
+        inner: Any = env.unwrapped
+        self.env, self.inner = env, inner
+        self.steps_per_frame = -(-int(inner.control_rate) // MOST_FPS)
+        model, near, far = inner.mj_model, inner.camera.near, inner.camera.far
         self.cameras = [StaticCamera(model, view, SIZE, SIZE, near, far) for view in VIEWS]
 
     def close(self) -> None:
@@ -67,23 +69,23 @@ class Film:
         self.frames: list[NDArray[np.uint8]] = []
 
     def watch(self, step: int) -> None:
-        """Note where the TCP is, and take a picture every other control step."""
-        self._path.append(np.array(self._studio.tabletop.tcp_position))
-        if step % STEPS_PER_FRAME:
+        """Note where the point is, and take a picture now and then."""
+        self._path.append(point_position(self._studio.env, mark_of(self._setup)))
+        if step % self._studio.steps_per_frame:
             return
         views = [self._view(camera) for camera in self._studio.cameras]
         left = np.linalg.norm(self._path[-1] - self._setup.goal.point_world)
-        camera = self._studio.tabletop.camera  # what the model sees by, so in its pixels
+        camera = self._studio.inner.camera  # what the model sees by, so in its pixels
         seen = camera.project(camera.to_camera(self._path[-1])) - self._setup.goal.pixel
         text = f"{self._caption}  step {step}  {100 * left:.1f} cm  {np.linalg.norm(seen):.1f} px"
         self.frames.append(_captioned(np.concatenate(views, axis=1), text))
 
     def _view(self, camera: StaticCamera) -> NDArray[np.uint8]:
-        picture = Image.fromarray(camera.render(self._studio.tabletop.mj_data)[0])
+        picture = Image.fromarray(camera.render(self._studio.inner.mj_data)[0])
         way = _pixels(camera.geometry, np.array(self._path))
         u, v = _pixels(camera.geometry, self._setup.goal.point_world[None])[0]
-        _draw_lines(picture, [way], TCP_COLOUR, 1)
-        _draw_dot(picture, way[-1], TCP_COLOUR)
+        _draw_lines(picture, [way], POINT_COLOUR, 1)
+        _draw_dot(picture, way[-1], POINT_COLOUR)
         _draw_lines(picture, [[(u - 6, v), (u + 6, v)], [(u, v - 6), (u, v + 6)]], GOAL_COLOUR, 2)
         return np.asarray(picture)
 
@@ -91,7 +93,8 @@ class Film:
         """Write `path`.mp4 and `path`.png (a strip of some frames)."""
         path.parent.mkdir(parents=True, exist_ok=True)
         with written_aside(path.with_suffix(".mp4")) as aside:
-            iio.imwrite(aside, np.stack(self.frames), extension=".mp4", fps=FPS, output_params=["-f", "mp4"])
+            fps = int(self._studio.inner.control_rate) / self._studio.steps_per_frame
+            iio.imwrite(aside, np.stack(self.frames), extension=".mp4", fps=fps, output_params=["-f", "mp4"])
         chosen = np.unique(np.linspace(0, len(self.frames) - 1, STRIP_FRAMES).round().astype(int))
         rows = [np.concatenate(np.split(self.frames[i], len(VIEWS), axis=1), axis=0) for i in chosen]
         with written_aside(path.with_suffix(".png")) as aside:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_collection.files import written_aside
-from planning.episode import THRESHOLDS, Record
+from planning.episode import Record
 from planning.film import VIEWS, film_path
 
 COLUMNS = 5
@@ -57,11 +57,10 @@ def telling(couple: Sequence[Record]) -> tuple[bool, bool, float]:
     the pixel and the farther from the point, as shares of the way.
     """
     ours, theirs = couple
-    threshold = THRESHOLDS[0]
-    misses = theirs.success(threshold, "2d") and not theirs.success(threshold, "3d")
+    misses = theirs.reached("2d") and not theirs.reached("3d")
     beside = theirs.final_distance / theirs.initial_distance
     beside -= theirs.final_pixel_distance / theirs.initial_pixel_distance
-    return misses and ours.success(threshold, "3d"), misses, beside
+    return misses and ours.reached("3d"), misses, beside
 
 
 def _stacked(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -11,30 +11,45 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from data_collection.files import written_aside
-from planning.episode import THRESHOLDS, Record
+from planning.episode import Record
 from planning.statistics import wilson_interval
 
 AXIS_SPLIT = 0.5  # share of the way along the optical axis that parts "across" from "along"
 AXIS_BINS = (0.0, 0.25, 0.5, 0.75, 1.0)  # bounds of a finer division by that share
-PARTS = ("all", "across", "along")
+AXIS_PARTS = ("across", "along")
+PARTINGS = (AXIS_PARTS, ("behind", "round"), ("open", "shut"))
+"""What the setups of a task fall into: two parts."""
+TITLES = {
+    "all": "all",
+    "across": "across the optical axis",
+    "along": "along it",
+    "behind": "tip starts behind the object",
+    "round": "tip has to go round",
+    "open": "drawer to be opened",
+    "shut": "drawer to be shut",
+}
 
 
 def summarise(records: Sequence[Record]) -> dict[str, Any]:
     """One model's entry in `servo.json`; distances in metres, shares in [0, 1], intervals of 95 % (Wilson)."""
     summary: dict[str, Any] = {"episodes": len(records), "setups": len({record.setup for record in records})}
+    limits = records[0].limits
     for space in ("2d", "3d"):
-        hits = [record.success(THRESHOLDS[0], space) for record in records]
+        hits = [record.reached(space) for record in records]
         summary[f"success_{space}"] = float(np.mean(hits))
         summary[f"success_{space}_interval"] = list(wilson_interval(sum(hits), len(hits)))
         summary[f"success_{space}_at"] = {
-            str(threshold): float(np.mean([record.success(threshold, space) for record in records]))
-            for threshold in THRESHOLDS
+            str(limit): float(np.mean([record.success(limit, space) for record in records])) for limit in limits
         }
     summary["final_distance_m_median"] = float(np.median([record.final_distance for record in records]))
     summary["least_distance_m_median"] = float(np.median([record.least_distance for record in records]))
     summary["initial_distance_m_median"] = float(np.median([record.initial_distance for record in records]))
     summary["plan_seconds_median"] = float(np.median([record.plan_seconds for record in records]))
-    summary["by_axis_share"] = {part: _share([r for r in records if in_part(r, part)]) for part in PARTS[1:]}
+    parts = parting(records)
+    by_part = {part: _share([record for record in records if in_part(record, part)]) for part in parts}
+    if parts != AXIS_PARTS:
+        return {**summary, "by_part": by_part}
+    summary["by_axis_share"] = by_part
     numbers = np.digitize([record.axis_share for record in records], AXIS_BINS[1:-1])
     summary["by_axis_bin"] = [
         {
@@ -47,16 +62,27 @@ def summarise(records: Sequence[Record]) -> dict[str, Any]:
     return summary
 
 
+def parting(records: Sequence[Record]) -> tuple[str, str]:
+    """The two parts that the setups of these episodes fall into."""
+    return next((parts for parts in PARTINGS if records[0].part in parts), AXIS_PARTS)
+
+
 def in_part(record: Record, part: str) -> bool:
-    """Whether an episode is one of the `across` or `along` setups; all are of `all`."""
-    return part == "all" or (part == "along") == (record.axis_share >= AXIS_SPLIT)
+    """Whether an episode is of a part of the setups; all are of `all`."""
+    own = record.part or AXIS_PARTS[int(record.axis_share >= AXIS_SPLIT)]
+    return part in ("all", own)
+
+
+def parts_of(entry: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The entries of the two parts, of a model's entry in `servo.json`."""
+    return entry["by_axis_share"] if "by_axis_share" in entry else entry["by_part"]
 
 
 def _share(records: Sequence[Record]) -> dict[str, Any]:
     """Successes of a part of the episodes, which may be empty."""
     part: dict[str, Any] = {"episodes": len(records)}
     for space in ("2d", "3d"):
-        hits = sum(record.success(THRESHOLDS[0], space) for record in records)
+        hits = sum(record.reached(space) for record in records)
         part[f"success_{space}"] = hits / len(records) if records else None
         part[f"success_{space}_interval"] = list(wilson_interval(hits, len(records)))
     return part
@@ -64,23 +90,24 @@ def _share(records: Sequence[Record]) -> dict[str, Any]:
 
 def table(models: dict[str, dict[str, Any]]) -> str:
     """The summaries as text, one model a line."""
-    head = ["model", "episodes", "3D", "95%", "at-5%", "at-2.5%", "2D", "95%", "final-m", "s/plan", "across", "along"]
-    rows = [head]
+    some = next(iter(models.values()))
+    tighter, parts = list(some["success_3d_at"])[1:], list(parts_of(some))
+    share = "by_axis_share" in some
+    at = [f"at-{100 * float(limit):g}%" if share else f"at-{1000 * float(limit):g}mm" for limit in tighter]
+    rows = [["model", "episodes", "3D", "95%", *at, "2D", "95%", "final-m", "s/plan", *parts]]
     for name, entry in models.items():
-        at, axis = entry["success_3d_at"], entry["by_axis_share"]
         rows.append(
             [
                 name,
                 str(entry["episodes"]),
                 _percent(entry["success_3d"]),
                 _interval(entry["success_3d_interval"]),
-                *(_percent(at[str(threshold)]) for threshold in THRESHOLDS[1:]),
+                *(_percent(entry["success_3d_at"][limit]) for limit in tighter),
                 _percent(entry["success_2d"]),
                 _interval(entry["success_2d_interval"]),
                 f"{entry['final_distance_m_median']:.3f}",
                 f"{entry['plan_seconds_median']:.4f}",
-                _percent(axis["across"]["success_3d"]),
-                _percent(axis["along"]["success_3d"]),
+                *(_percent(parts_of(entry)[part]["success_3d"]) for part in parts),
             ]
         )
     return aligned(rows)
@@ -101,18 +128,17 @@ def _interval(interval: Sequence[float]) -> str:
 
 
 def bar_chart(models: dict[str, dict[str, Any]], path: Path, title: str) -> None:
-    """Draw success in 2D and 3D, and 3D success by the way's direction, with 95 % intervals, as a PNG."""
+    """Draw success in 2D and 3D, and 3D success by the parts of the setups, with 95 % intervals, as a PNG."""
     figure = Figure(figsize=(4 + 1.6 * len(models), 3.8), layout="constrained")
     overall, split = figure.subplots(1, 2, sharey=True)
     _bars(overall, models, {"2D": lambda m: (m, "2d"), "3D": lambda m: (m, "3d")}, ("#9bb7d4", "#1f4e79"))
-    sides = {
-        "across the optical axis": lambda m: (m["by_axis_share"]["across"], "3d"),
-        "along it": lambda m: (m["by_axis_share"]["along"], "3d"),
-    }
+    parts = parts_of(next(iter(models.values())))
+    sides = {TITLES[part]: lambda entry, part=part: (parts_of(entry)[part], "3d") for part in parts}
     _bars(split, models, sides, ("#b9d8b4", "#2f6b2a"))
     overall.set_ylabel("success [%]")
     overall.set_title(title, fontsize=10)
-    split.set_title("3D, by the direction of the way", fontsize=10)
+    by_way = tuple(parts) == AXIS_PARTS
+    split.set_title("3D, by the direction of the way" if by_way else "3D, by what there is to do", fontsize=10)
     with written_aside(path) as aside:
         figure.savefig(aside, format="png", dpi=150)
 

@@ -1,9 +1,9 @@
-"""`servo-eval`: how often controllers bring the arm to a 3D point, on the same setups for all of them."""
+"""`servo-eval`: how often controllers bring a point to where it shall be, on the same setups for all of them."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,13 +18,14 @@ from data_collection.files import locked, write_json
 from envs.errors import UsageError
 from planning.comparison import comparison_chart, difference_table, differences
 from planning.controllers import CONTROLLERS, LEARNED, PIXEL_MODELS, Kit
-from planning.episode import Record, run_episode
+from planning.episode import Record, mark_of, run_episode
 from planning.film import Film, Studio, film_path
 from planning.filmstrip import filmstrip
 from planning.icem import ICEMConfig
 from planning.records import EpisodeLog
 from planning.report import bar_chart, summarise, table
-from planning.setups import Setup, make_setup
+from planning.setups import Setup
+from planning.tasks import TASKS, Task
 from worldmodel.memory import keep_freed_memory
 
 EPISODE_ENTROPY = 0xE9150DE  # sets the planners' randomness apart from the setups'
@@ -32,14 +33,19 @@ EPISODE_ENTROPY = 0xE9150DE  # sets the planners' randomness apart from the setu
 
 @dataclass(frozen=True)
 class ServoConfig:
-    """Let controllers servo the arm to random 3D points and report how often they arrive.
+    """Let controllers servo a point to random goals in 3D and report how often it arrives.
 
-    An episode succeeds if the end-effector is within 10 % of its initial distance to the goal for at least 5 control
-    steps. The same command again goes on where a stopped run ended.
+    The point is the hand's, or lies on a thing that has to be pushed or pulled there. An episode succeeds if it is near
+    its goal for at least 5 control steps: the hand within 10 % of its initial distance, a thing within 20 mm. The same
+    command again goes on where a stopped run ended.
     """
 
     out: Path = Path("runs/servo")
     """folder for servo.json, episodes.jsonl, the charts and the videos"""
+    env: Literal["tabletop", "planar-push"] = "tabletop"
+    """environment; the shipped models are those that were trained for it"""
+    point: Literal["hand", "drawer", "object"] = "hand"
+    """whose point is to reach the goal: the hand or the drawer of the tabletop, the object of planar-push"""
     model: tuple[str, ...] = ("t3vip",)
     """controllers to compare: t3vip plans in 3D; sv2p, sna and cdna are given the goal's pixel only; oracle plans in
     the simulator; linear, proportional and random have no world model"""
@@ -51,9 +57,10 @@ class ServoConfig:
     """distinct setups; with --repeats in place of --episodes"""
     repeats: int = 1
     """episodes per setup; --setups 10 --repeats 5 is the paper's protocol"""
-    scene: Literal["A", "B", "C", "D"] = "D"
-    """tabletop scene; the shipped models have never seen D"""
-    steps: int = 100
+    scene: str = TASKS["tabletop", "hand"].scenes[0]
+    """tabletop: A, B, C or D; planar-push: objects of train, validation, test or all. No shipped model has seen D or
+    test"""
+    steps: int = TASKS["tabletop", "hand"].steps
     """budget of control steps per episode"""
     seed: int = 0
     """of the setups and the planners"""
@@ -70,6 +77,11 @@ class ServoConfig:
     """where world models run, e.g. cpu or cuda"""
 
     def __post_init__(self) -> None:
+        if (self.env, self.point) not in TASKS:
+            known = " or ".join(point for env, point in TASKS if env == self.env)
+            raise UsageError(f"--point is {self.point}, but {self.env} has only {known}; choose one of its points")
+        if self.scene not in self.task.scenes:
+            raise UsageError(f"--scene is {self.scene}; {self.env} has {', '.join(sorted(self.task.scenes))}")
         for name in self.model:
             if name not in CONTROLLERS:
                 raise UsageError(f"unknown model '{name}'; known are {', '.join(CONTROLLERS)}")
@@ -85,6 +97,11 @@ class ServoConfig:
         if self.deadline is not None and not self.deadline > 0:
             raise UsageError(f"--deadline is {self.deadline}; give a positive number of seconds")
         self.checkpoints()
+
+    @property
+    def task(self) -> Task:
+        """What is asked for."""
+        return TASKS[self.env, self.point]
 
     def checkpoints(self) -> dict[str, str]:
         """World model -> its weights, as given."""
@@ -114,14 +131,11 @@ class ServoConfig:
 def main(config: ServoConfig) -> None:
     """Run what is missing, then report on everything."""
     keep_freed_memory()
-    env = gym.make(
-        f"envs:t3vip/Tabletop{config.scene}-v0",
-        image_size=config.image_size,
-        max_episode_steps=-1,
-        disable_env_checker=True,
-    )
+    task = config.task
+    env = task.make_env(config.scene, config.image_size)
     studio = Studio(env)
     kit = Kit(env, config.planner, config.hold, config.checkpoints(), config.device, config.deadline)
+    kit.body, kit.surface, kit.reach = task.body, task.surface, task.reach
     try:
         learned = {name: kit.model(name) for name in config.model if name in LEARNED}
         kit.hold = common_gap(learned) or config.hold
@@ -153,6 +167,8 @@ def common_gap(learned: dict[str, Any]) -> int | None:
 def settings(config: ServoConfig, hold: int, learned: dict[str, Any]) -> dict[str, Any]:
     """What an episode's outcome depends on, apart from its model, setup and repeat."""
     kept = {name: getattr(config, name) for name in ("scene", "steps", "seed", "image_size", "deadline")}
+    if config.task.surface is not None:  # the hand's folders are older and do not say
+        kept |= {"env": config.env, "point": config.point, "reach": config.task.reach}
     weights = {name: weights_hash(model) for name, model in learned.items()}
     return {**kept, "hold": hold, "planner": asdict(config.planner), "checkpoints": weights}
 
@@ -179,7 +195,8 @@ def run_missing(config: ServoConfig, env: gym.Env, studio: Studio, kit: Kit, log
     with tqdm(todo, total=done + len(todo), initial=done, unit="episode", desc="servo") as progress:
         for index, repeat, name in progress:
             if setup is None or setup.index != index:
-                setup = make_setup(env, index, config.seed)
+                setup = config.task.make_setup(env, index, config.seed)
+                kit.mark = mark_of(setup)
             entropy = (EPISODE_ENTROPY, config.seed, index, repeat)
             kit.rng = np.random.default_rng(np.random.SeedSequence(entropy))
             filmed = index * config.repeats + repeat < config.video
@@ -199,8 +216,9 @@ def report(config: ServoConfig, log: EpisodeLog) -> None:
     records = {name: [log.records[name, setup, repeat] for setup, repeat in attempts] for name in config.model}
     models = {name: summarise(of_model) for name, of_model in records.items()}
     paired = differences(records)
-    title = f"servo on scene {config.scene}, {len(attempts)} episodes each"
-    document = {"scene": config.scene, "seed": config.seed, "models": models, "t3vip_less": paired}
+    title = f"{config.task.where.replace('{scene}', config.scene)}, {len(attempts)} episodes each"
+    asked = {name: getattr(config, name) for name in ("env", "point", "scene", "seed")}
+    document = {**asked, "models": models, "t3vip_less": paired}
     write_json(config.out / "servo.json", document)
     written = ["servo.json", "episodes.jsonl", "success.png"]
     bar_chart(models, config.out / "success.png", title)
@@ -218,9 +236,30 @@ def report(config: ServoConfig, log: EpisodeLog) -> None:
     print(f"written to {config.out}: {', '.join(written)}")
 
 
+def usual_options(arguments: Sequence[str]) -> ServoConfig:
+    """The options that hold for the environment and the point that a command line names.
+
+    Raises:
+        UsageError: there is no such task.
+    """
+    named: dict[str, str] = {}
+    for here, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        option, separator, value = here.partition("=")
+        if option in ("--env", "--point"):
+            named[option[2:]] = value if separator else following
+    env = named.get("env", "tabletop")
+    points = [point for known, point in TASKS if known == env]
+    point = named.get("point", points[0] if points else "")
+    if point not in points:
+        known = ", ".join(f"--env {env} --point {point}" for env, point in TASKS)
+        raise UsageError(f"nothing is known of --env {env} --point {point or 'object'}; there is {known}")
+    task = TASKS[env, point]
+    return ServoConfig(env=env, point=point, scene=task.scenes[0], steps=task.steps, planner=task.planner)  # type: ignore[arg-type]
+
+
 def command() -> None:
     """Console script."""
-    envs.command.run(ServoConfig, main)
+    envs.command.run(ServoConfig, main, default=usual_options)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -9,8 +11,18 @@ from envs.actions import clip_sequences
 from envs.batch import BatchPhysics
 from envs.tabletop import control
 from envs.tabletop.control import Pose
-from envs.tabletop.env import TabletopEnv
+from envs.tabletop.env import FIXTURES, TabletopEnv
 from envs.tabletop.scene import SUBSTEPS, TIMESTEP
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """Where things go, after each action."""
+
+    tcp: NDArray[np.float64]
+    """(N, T, 3) measured position of the tool centre point, metres, world frame."""
+    fixtures: NDArray[np.float64]
+    """(N, T, 4) positions of the joints of `FIXTURES`, metres."""
 
 
 class BatchSimulator(BatchPhysics[TabletopEnv]):
@@ -24,31 +36,33 @@ class BatchSimulator(BatchPhysics[TabletopEnv]):
     def __init__(self, env: TabletopEnv, threads: int | None = None) -> None:
         super().__init__(env, SUBSTEPS, threads)
         self._qpos, self._qvel = self._positions(), self._velocities()
+        self._fixtures = [self._qpos.start + int(self._model.joint(name).qposadr[0]) for name in FIXTURES]
 
-    def rollout_tcp(self, states: ArrayLike, actions: ArrayLike) -> NDArray[np.float64]:
-        """Where the tool centre point goes.
+    def rollout(self, states: ArrayLike, actions: ArrayLike) -> Paths:
+        """Where the tool centre point and the fixtures go.
 
         Args:
             states: (S,) one state for all, or (N, S) one for each, from `TabletopEnv.get_state`.
             actions: (N, T, 7) in [-1, 1]; clipped.
-
-        Returns:
-            (N, T, 3) measured position after each action, metres, world frame.
 
         Raises:
             UsageError: the shapes do not fit, or an action is not finite.
         """
         actions = clip_sequences(actions, 7)
         physics, warmstart = self._unpack(states, len(actions))
-        path = np.empty((*actions.shape[:2], 3))
+        tcps, fixtures = np.empty((*actions.shape[:2], 3)), np.empty((*actions.shape[:2], len(FIXTURES)))
         for step in range(actions.shape[1]):
             tcp = self._tcp(physics)
             controls = self._aim(physics, tcp, actions[:, step])
             substeps = self._substep(physics, warmstart, controls[:, None])
             physics = substeps[:, -1].copy()
             warmstart = (substeps[:, -1, self._qvel] - substeps[:, -2, self._qvel]) / TIMESTEP
-            path[:, step] = self._tcp(physics).position
-        return path
+            tcps[:, step], fixtures[:, step] = self._tcp(physics).position, physics[:, self._fixtures]
+        return Paths(tcps, fixtures)
+
+    def rollout_tcp(self, states: ArrayLike, actions: ArrayLike) -> NDArray[np.float64]:
+        """Of `rollout`, the tool centre point: (N, T, 3) metres."""
+        return self.rollout(states, actions).tcp
 
     def _tcp(self, physics: NDArray) -> Pose:
         return self._env.kinematics.tcp(physics[:, self._qpos][:, self._env.kinematics.qpos_index])

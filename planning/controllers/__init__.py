@@ -21,15 +21,15 @@ LEARNED = ("t3vip", *PIXEL_MODELS)
 
 
 def _pixel(name: str) -> Callable[[Kit], Controller]:
-    return lambda kit: PixelController(name, kit.model(name), kit.camera, kit.planner())
+    return lambda kit: PixelController(name, kit.model(name), kit.camera, **kit.planning_parts())
 
 
 # A new controller is one line.
 CONTROLLERS: dict[str, Callable[[Kit], Controller]] = {
-    "t3vip": lambda kit: T3VIPController(kit.model("t3vip"), kit.camera, kit.planner()),
+    "t3vip": lambda kit: T3VIPController(kit.model("t3vip"), kit.camera, **kit.planning_parts()),
     **{name: _pixel(name) for name in PIXEL_MODELS},
-    "oracle": lambda kit: OracleController(kit.env, kit.simulator, kit.planner(), kit.hold),
-    "linear": lambda kit: LinearController(kit.planner(), kit.hold),
-    "proportional": lambda kit: ProportionalController(),
-    "random": lambda kit: RandomController(kit.hold, kit.rng),
+    "oracle": lambda kit: OracleController(kit.simulator, kit.mark, hold=kit.hold, **kit.planning_parts()),
+    "linear": lambda kit: LinearController(hold=kit.hold, **kit.planning_parts()),
+    "proportional": lambda kit: ProportionalController(**kit.parts()),
+    "random": lambda kit: RandomController(kit.hold, kit.rng, kit.body()),
 }

@@ -3,36 +3,21 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.costs import env_action
+from planning.effectors import Arm, Effector, Observation, held_gripper
+from planning.followers import EffectorFollower, Follower
+from planning.goals import Goal
 from planning.icem import ICEM, CostFunction
 
-Observation = dict[str, Any]
-
-TCP = slice(0, 3)  # position of the end-effector in `proprio`, metres, world
-GRIPPER = 14  # last gripper command in `proprio`
-
-
-@dataclass(frozen=True, eq=False)
-class Goal:
-    """Where the end-effector is to go.
-
-    Attributes:
-        point_world: (3,) float64, metres, world frame.
-        pixel: (2,) float64, the same point in the picture (u, v), pixels.
-    """
-
-    point_world: NDArray[np.float64]
-    pixel: NDArray[np.float64]
+__all__ = ["Controller", "Goal", "HoldingController", "Observation", "PlanningController", "held_gripper"]
 
 
 class Controller(Protocol):
-    """Brings the end-effector to a goal, one action per control step."""
+    """Brings the designated point to a goal, one action per control step."""
 
     name: str
     plan_seconds: list[float]
@@ -45,9 +30,14 @@ class Controller(Protocol):
 
 
 class HoldingController:
-    """Decides on a translation every `hold` control steps and holds it in between.
+    """Decides on a move every `hold` control steps and holds it in between.
 
-    A subclass says in `decide` which translation. The gripper keeps the command that it had at the start.
+    A subclass says in `decide` which move.
+
+    Args:
+        hold: control steps.
+        effector: what is moved; the arm when None.
+        follower: knows where the designated point is; when None it is the end-effector's own.
 
     Attributes:
         plan_seconds: wall time of each decision of the current episode.
@@ -55,39 +45,56 @@ class HoldingController:
 
     name = "holding"
 
-    def __init__(self, hold: int, action_dim: int = 7) -> None:
+    def __init__(self, hold: int, effector: Effector | None = None, follower: Follower | None = None) -> None:
         self.hold = hold
-        self.action_dim = action_dim
+        self.effector = effector or Arm()
+        self.follower = follower or EffectorFollower(self.effector)
         self.plan_seconds: list[float] = []
 
     def reset(self, observation: Observation, goal: Goal) -> None:
         self.goal = goal
-        self.gripper = held_gripper(observation)
+        self.effector.reset(observation)
+        self.follower.reset(observation, goal)
         self.plan_seconds = []
         self._steps = 0
 
     def act(self, observation: Observation) -> NDArray[np.float32]:
+        start = time.perf_counter()
+        self.follower.observe(observation)
         if self._steps % self.hold == 0:
-            start = time.perf_counter()
-            self.action = env_action(self.decide(observation), self.gripper, self.action_dim)
+            self.action = self.effector.action(self.decide(observation))
             self.plan_seconds.append(time.perf_counter() - start)
         self._steps += 1
         return self.action
 
     def decide(self, observation: Observation) -> NDArray:
-        """The translation (3,) in [-1, 1] to hold from this observation on."""
+        """The move (axes,), within the effector's limit, to hold from this observation on."""
         raise NotImplementedError
 
 
 class PlanningController(HoldingController):
-    """Searches the translations of the next few frames with iCEM and holds the first.
+    """Searches the moves of the next few frames with iCEM and holds the first.
 
-    A subclass says in `imagine` what a sequence of translations costs.
+    A subclass says in `imagine` what a sequence of moves costs.
+
+    Args:
+        planner: searches sequences of moves.
+        hold, effector, follower: see `HoldingController`.
+        reach: weight of the end-effector's distance to the point beside the point's to the goal. What is not touched
+            does not move, whatever is done elsewhere: without this, all plans that do not come to touch the thing in
+            time would cost the same.
     """
 
-    def __init__(self, planner: ICEM, hold: int, action_dim: int = 7) -> None:
-        super().__init__(hold, action_dim)
-        self.planner = planner
+    def __init__(
+        self,
+        planner: ICEM,
+        hold: int,
+        effector: Effector | None = None,
+        follower: Follower | None = None,
+        reach: float = 0.0,
+    ) -> None:
+        super().__init__(hold, effector, follower)
+        self.planner, self.reach = planner, reach
 
     def reset(self, observation: Observation, goal: Goal) -> None:
         super().reset(observation, goal)
@@ -97,15 +104,5 @@ class PlanningController(HoldingController):
         return self.planner.plan(self.imagine(observation)).actions[0]
 
     def imagine(self, observation: Observation) -> CostFunction:
-        """The cost of sequences of held translations (N, horizon, 3), as a function, from this observation on."""
+        """The cost of sequences of held moves (N, horizon, axes), as a function, from this observation on."""
         raise NotImplementedError
-
-
-def tcp_position(observation: Observation) -> NDArray[np.float64]:
-    """The end-effector's measured position (3,) in the world, metres."""
-    return np.asarray(observation["proprio"][TCP], np.float64)
-
-
-def held_gripper(observation: Observation) -> float:
-    """The command, -1 or 1, that keeps the gripper as it is."""
-    return 1.0 if observation["proprio"][GRIPPER] >= 0 else -1.0

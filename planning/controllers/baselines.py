@@ -2,52 +2,64 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from envs.tabletop.control import ACTION_SCALE
-from planning.controllers.base import Goal, HoldingController, Observation, PlanningController, tcp_position
+from planning.controllers.base import Goal, HoldingController, Observation, PlanningController
 from planning.costs import discounted_distance
+from planning.effectors import Effector
+from planning.followers import Follower
 from planning.icem import CostFunction
 
-METRES_PER_ACTION = ACTION_SCALE[0]  # of a full translation over one control step
+METRES_PER_ACTION = ACTION_SCALE[0]  # of a full translation of the arm over one control step
 
 
 class RandomController(HoldingController):
-    """Uniform translations, held as long as a planned one: the lower bound."""
+    """Uniform moves, held as long as a planned one: the lower bound."""
 
     name = "random"
 
-    def __init__(self, hold: int, rng: np.random.Generator) -> None:
-        super().__init__(hold)
+    def __init__(self, hold: int, rng: np.random.Generator, effector: Effector | None = None) -> None:
+        super().__init__(hold, effector)
         self.rng = rng
 
+    def reset(self, observation: Observation, goal: Goal) -> None:
+        super().reset(observation, replace(goal, designated=None))  # it does not look
+
     def decide(self, observation: Observation) -> NDArray:
-        return self.rng.uniform(-1, 1, 3)
+        return self.rng.uniform(-self.effector.limit, self.effector.limit, self.effector.axes)
 
 
 class ProportionalController(HoldingController):
-    """Straight to the goal by proprioception, knowing the units of the actions; decides at every control step.
+    """Moves as the point is to move, straight towards the goal; decides at every control step.
+
+    It knows the units of the actions, and nothing of how the point moves when the end-effector does. That is enough
+    where the point is the end-effector's own.
 
     Args:
+        effector, follower: see `HoldingController`.
         gain: share of the remaining way that is commanded per step.
     """
 
     name = "proportional"
 
-    def __init__(self, gain: float = 0.5) -> None:
-        super().__init__(hold=1)
+    def __init__(self, effector: Effector | None = None, follower: Follower | None = None, gain: float = 0.5) -> None:
+        super().__init__(1, effector, follower)
         self.gain = gain
 
     def decide(self, observation: Observation) -> NDArray:
-        move = self.gain * (self.goal.point_world - tcp_position(observation)) / METRES_PER_ACTION
-        return move / max(1.0, np.abs(move).max())
+        way = (self.goal.point_world - self.follower.point)[: self.effector.axes]
+        move = self.gain * way / self.effector.metres
+        return move / max(1.0, np.abs(move).max() / self.effector.limit)
 
 
 class LinearController(PlanningController):
-    """Plans with a linear model `TCP motion = B @ action`, fitted by least squares while the episode runs.
+    """Plans with a linear model `motion of the point = B @ move`, fitted by least squares while the episode runs.
 
-    It knows nothing to begin with: its first decisions move along x, y and z in turn, and from then on every decision
+    It knows nothing to begin with: its first decisions move along each axis in turn, and from then on every decision
     refits B to the whole episode. What it costs to learn the arm anew is thus inside the budget of steps.
     """
 
@@ -60,8 +72,10 @@ class LinearController(PlanningController):
         self._positions: list[NDArray] = []
 
     def decide(self, observation: Observation) -> NDArray:
-        self._positions.append(tcp_position(observation))
-        probes = np.eye(3) * np.sign(self.goal.point_world - self._positions[0])[:, None]
+        self._positions.append(np.array(self.follower.point))
+        axes = self.effector.axes
+        way = (self.goal.point_world - self._positions[0])[:axes]
+        probes = self.effector.limit * np.eye(axes) * np.sign(way)[:, None]
         tried = len(self._moves)
         move = probes[tried] if tried < len(probes) else super().decide(observation)
         self._moves.append(move)
@@ -70,10 +84,14 @@ class LinearController(PlanningController):
     def imagine(self, observation: Observation) -> CostFunction:
         moves = np.array(self._moves)
         motions = np.diff(self._positions, axis=0)
-        transposed = np.linalg.solve(moves.T @ moves + self.ridge * np.eye(3), moves.T @ motions)  # B^T
+        transposed = np.linalg.solve(moves.T @ moves + self.ridge * np.eye(moves.shape[1]), moves.T @ motions)  # B^T
 
         def cost(sequences: NDArray) -> NDArray:
             positions = self._positions[-1] + np.cumsum(sequences @ transposed, axis=1)  # (N, h, 3)
-            return discounted_distance(np.linalg.norm(positions - self.goal.point_world, axis=-1))
+            distances = np.linalg.norm(positions - self.goal.point_world, axis=-1)
+            if self.reach:
+                effector = self.effector.path(observation, sequences, self.hold)
+                distances = distances + self.reach * np.linalg.norm(positions - effector, axis=-1)
+            return discounted_distance(distances)
 
         return cost

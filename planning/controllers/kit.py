@@ -11,11 +11,15 @@ import numpy as np
 
 from envs.camera import CameraModel
 from envs.errors import UsageError
-from envs.tabletop.simulate import BatchSimulator
+from planning.effectors import Arm, Effector
+from planning.followers import EffectorFollower, Follower, Surface, SurfaceFollower
 from planning.icem import ICEM, ICEMConfig
+from planning.marks import Mark
+from planning.what_if import WhatIf, what_if
 from worldmodel import checkpoint
 
-TRANSLATION_LOW, TRANSLATION_HIGH = -np.ones(3), np.ones(3)
+FAMILIES = {"t3vip/Tabletop": "", "t3vip/PlanarPush": "planar-push/"}
+"""Environments of one kind, by how their ids begin, and before the names of the models that are shipped for them."""
 
 
 @dataclass
@@ -23,13 +27,17 @@ class Kit:
     """The parts that `CONTROLLERS` builds from.
 
     Attributes:
-        env: the tabletop environment.
+        env: the environment.
         planner_config: how iCEM searches, the same for every model.
-        hold: control steps that a planned translation is held for, where no world model's frame gap says so.
+        hold: control steps that a planned move is held for, where no world model's frame gap says so.
         checkpoints: world model -> file or name of its weights; a model that is missing uses the shipped ones.
         device: where world models run.
         deadline: seconds after which a plan must be there, if any.
+        body: what is moved.
+        surface: what the designated point lies on; None if it is the end-effector's own.
+        reach: weight of the end-effector's distance to the point, see `PlanningController`.
         rng: randomness of the next controller that is made.
+        mark: where the designated point of the next episode truly is, for the oracle; None if it is the end-effector's.
     """
 
     env: gym.Env
@@ -38,7 +46,11 @@ class Kit:
     checkpoints: dict[str, str] = field(default_factory=dict)
     device: str = "cpu"
     deadline: float | None = None
+    body: type[Effector] = Arm
+    surface: Surface | None = None
+    reach: float = 0.0
     rng: np.random.Generator = field(default_factory=np.random.default_rng)
+    mark: Mark | None = None
     _models: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
     @property
@@ -47,18 +59,27 @@ class Kit:
         return self.env.unwrapped.camera  # type: ignore[attr-defined]
 
     @functools.cached_property
-    def simulator(self) -> BatchSimulator:
+    def simulator(self) -> WhatIf:
         """What-if in the real simulator; for the oracle only."""
-        return BatchSimulator(self.env.unwrapped)  # type: ignore[arg-type]
+        return what_if(self.env)
 
     def close(self) -> None:
         """End the simulator's threads."""
         if "simulator" in self.__dict__:
             self.simulator.close()
 
-    def planner(self) -> ICEM:
-        """A planner of translations, with the randomness of this episode."""
-        return ICEM(self.planner_config, TRANSLATION_LOW, TRANSLATION_HIGH, self.rng, self.deadline)
+    def parts(self) -> dict[str, Any]:
+        """A new end-effector, and who follows the designated point by observations."""
+        effector = self.body()
+        follower: Follower
+        follower = EffectorFollower(effector) if self.surface is None else SurfaceFollower(self.camera, self.surface)
+        return {"effector": effector, "follower": follower}
+
+    def planning_parts(self) -> dict[str, Any]:
+        """What every controller that plans is given: a planner with the randomness of this episode, and the parts."""
+        limit = np.full(self.body.axes, self.body.limit)
+        planner = ICEM(self.planner_config, -limit, limit, self.rng, self.deadline)
+        return {"planner": planner, "reach": self.reach, **self.parts()}
 
     def model(self, name: str) -> Any:
         """The world model of that name, in evaluation mode.
@@ -67,18 +88,27 @@ class Kit:
             UsageError: there is no such checkpoint, or it was trained for another environment.
         """
         if name not in self._models:
-            model = checkpoint.load_model(self.checkpoints.get(name, name), self.device)
+            shipped = FAMILIES[_family(_env_id(self.env))] + name
+            model = checkpoint.load_model(self.checkpoints.get(name, shipped), self.device)
             _check_fits(name, model, self.env)
             self._models[name] = model
         return self._models[name]
+
+
+def _env_id(env: gym.Env) -> str:
+    return env.spec.id if env.spec else type(env.unwrapped).__name__
+
+
+def _family(env_id: str) -> str:
+    return next((family for family in FAMILIES if family in env_id), next(iter(FAMILIES)))
 
 
 def _check_fits(name: str, model: Any, env: gym.Env) -> None:
     """A model can plan for an environment that sees and acts like the one it was trained in."""
     if model.kind != name:
         raise UsageError(f"the checkpoint given for {name} is a {model.kind}; give the weights of a {name}")
-    trained, env_id = model.context.env_id, env.spec.id if env.spec else type(env.unwrapped).__name__
-    family = "t3vip/Tabletop"
+    trained, env_id = model.context.env_id, _env_id(env)
+    family = _family(env_id)
     if family not in trained:
         raise UsageError(f"the {name} checkpoint was trained in {trained}, not in {env_id}; give one of a {family}")
     camera: CameraModel = env.unwrapped.camera  # type: ignore[attr-defined]

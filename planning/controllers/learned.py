@@ -11,25 +11,27 @@ from numpy.typing import NDArray
 
 from data_collection.actions import aggregate_actions
 from envs.camera import CameraModel
-from planning.controllers.base import Goal, Observation, PlanningController, tcp_position
-from planning.costs import env_action
+from planning.controllers.base import Goal, Observation, PlanningController
 from planning.icem import ICEM
-from worldmodel.tracking import HAND_RADIUS
 
 
 class LearnedController(PlanningController):
     """Plans with a world model, which is shown frames and actions, nothing else.
 
-    Of the world a controller of this kind is given RGB-D frames, proprioception (for where the TCP is now, and the
-    gripper's command), the camera's geometry and the goal. A subclass says in `imagine` what it makes of the model's
-    predictions.
+    Of the world a controller of this kind is given RGB-D frames, proprioception (for where the end-effector is now, and
+    the gripper's command), the camera's geometry and the goal. A subclass says in `imagine` what it makes of the
+    model's predictions.
 
     Args:
         model: a world model (`worldmodel.load_model`) with `observe`, `step` and `frame_gap`.
         camera: geometry of the camera that takes the frames.
-        planner: searches sequences of translations, each held for `frame_gap` control steps.
+        planner: searches sequences of moves, each held for `frame_gap` control steps.
         context_frames: frames that the model is shown before every plan.
-        radius: metres around the TCP that are taken for the hand.
+        options: effector, follower, reach; see `PlanningController`.
+
+    Attributes:
+        frames: the last frames that the model is shown, the newest last.
+        designated: for each of them the pixels (M,) that show the body of the designated point, counted row by row.
     """
 
     def __init__(
@@ -38,10 +40,10 @@ class LearnedController(PlanningController):
         camera: CameraModel,
         planner: ICEM,
         context_frames: int = 2,
-        radius: float = HAND_RADIUS,
+        **options: Any,
     ) -> None:
-        super().__init__(planner, model.frame_gap, model.action_dim)
-        self.model, self.camera, self.radius = model, camera, radius
+        super().__init__(planner, model.frame_gap, **options)
+        self.model, self.camera = model, camera
         self.context_frames = context_frames
         parameter = next(iter(model.parameters()), None)
         self.device = torch.device("cpu") if parameter is None else parameter.device
@@ -49,28 +51,32 @@ class LearnedController(PlanningController):
     def reset(self, observation: Observation, goal: Goal) -> None:
         super().reset(observation, goal)
         self.frames: deque[Observation] = deque(maxlen=self.context_frames)
+        self.designated: deque[torch.Tensor] = deque(maxlen=self.context_frames)
         self.executed: deque[NDArray] = deque(maxlen=self.context_frames - 1)
 
     def decide(self, observation: Observation) -> NDArray:
+        pixels = self.follower.pixels(observation, self.camera)
         if not self.frames:  # nothing came before: the first frame, standing still
-            self.frames.extend([observation] * (self.context_frames - 1))
-            self.executed.extend([self.aggregated(np.zeros(3))] * (self.context_frames - 1))
+            before = self.context_frames - 1
+            self.frames.extend([observation] * before)
+            self.designated.extend([pixels] * before)
+            self.executed.extend([self.aggregated(np.zeros(self.effector.axes))] * before)
         self.frames.append(observation)
+        self.designated.append(pixels)
         move = super().decide(observation)
         self.executed.append(self.aggregated(move))
         return move
 
     def aggregated(self, moves: NDArray) -> NDArray[np.float32]:
-        """The actions (..., action_dim) of the model for translations (..., 3), each held for a frame gap."""
-        actions = env_action(moves, self.gripper, self.action_dim)
-        held = np.repeat(actions[..., None, :], self.hold, axis=-2)
+        """The actions (..., action_dim) of the model for moves (..., axes), each held for a frame gap."""
+        held = np.repeat(self.effector.action(moves)[..., None, :], self.hold, axis=-2)
         return aggregate_actions(held, self.model.context.action_aggregation, self.model.context.action_scale)
 
     def observed(self) -> Any:
         """The model's state after the frames so far."""
         rgb = self.tensor(np.stack([frame["rgb"] for frame in self.frames])) / 255
         depth = self.tensor(np.stack([frame["depth"] for frame in self.frames]))
-        actions = np.reshape(np.array(self.executed, np.float32), (-1, self.action_dim))
+        actions = np.reshape(np.array(self.executed, np.float32), (-1, self.model.action_dim))
         with torch.inference_mode():
             return self.model.observe(rgb.permute(0, 3, 1, 2)[None], depth[None, :, None], self.tensor(actions)[None])
 
@@ -78,9 +84,9 @@ class LearnedController(PlanningController):
         """What the camera sees, (3, H, W), metres, camera frame."""
         return self.tensor(self.camera.unproject(observation["depth"])).permute(2, 0, 1)
 
-    def tcp_in_camera(self, observation: Observation) -> torch.Tensor:
-        """The measured TCP (3,), metres, camera frame."""
-        return self.tensor(self.camera.to_camera(tcp_position(observation)))
+    def in_camera(self, points: NDArray) -> torch.Tensor:
+        """Points (..., 3) of the world in the camera frame, metres."""
+        return self.tensor(self.camera.to_camera(points))
 
     def tensor(self, array: NDArray) -> torch.Tensor:
         """Float32, where the model is."""

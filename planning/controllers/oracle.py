@@ -4,40 +4,42 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.tabletop.simulate import BatchSimulator
 from planning.controllers.base import Observation, PlanningController
-from planning.costs import discounted_distance, env_action
+from planning.costs import discounted_distance
 from planning.icem import ICEM, CostFunction
+from planning.marks import Mark
+from planning.what_if import WhatIf
 
 
 class OracleController(PlanningController):
-    """Plans in copies of the simulator's state. It alone is given the environment.
+    """Plans in copies of the simulator's state. It alone is given the simulator, and where the point truly is.
 
     Args:
-        env: the tabletop environment that is being controlled.
-        simulator: of the same environment.
-        planner: searches sequences of translations.
-        hold: control steps that each translation is held for.
+        what_if: the simulator.
+        mark: the designated point; None for the end-effector's.
+        planner, hold, options: see `PlanningController`.
     """
 
     name = "oracle"
 
-    def __init__(self, env: gym.Env, simulator: BatchSimulator, planner: ICEM, hold: int) -> None:
-        super().__init__(planner, hold)
-        self.simulator = simulator
-        self.tabletop: Any = env.unwrapped
+    def __init__(self, what_if: WhatIf, mark: Mark | None, planner: ICEM, hold: int, **options: Any) -> None:
+        super().__init__(planner, hold, **options)
+        self.what_if, self.mark = what_if, mark
 
     def imagine(self, observation: Observation) -> CostFunction:
-        state = self.tabletop.get_state()
+        state = self.what_if.state()
 
         def cost(sequences: NDArray) -> NDArray:
-            actions = np.repeat(env_action(sequences, self.gripper), self.hold, axis=1)  # (N, h * hold, 7)
-            path = self.simulator.rollout_tcp(state, actions)
-            reached = path[:, self.hold - 1 :: self.hold]  # (N, h, 3), after each held translation
-            return discounted_distance(np.linalg.norm(reached - self.goal.point_world, axis=-1))
+            actions = np.repeat(self.effector.action(sequences), self.hold, axis=1)  # (N, h * hold, A)
+            paths = self.what_if.paths(state, actions, self.mark)
+            after = slice(self.hold - 1, None, self.hold)  # each held move
+            effector, point = paths.effector[:, after], paths.point[:, after]  # (N, h, 3)
+            distances = np.linalg.norm(point - self.goal.point_world, axis=-1)
+            if self.reach:
+                distances = distances + self.reach * np.linalg.norm(effector - point, axis=-1)
+            return discounted_distance(distances)
 
         return cost

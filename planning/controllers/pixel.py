@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,19 +10,18 @@ import torch
 from numpy.typing import NDArray
 
 from envs.camera import CameraModel
-from planning.controllers.base import Goal, Observation, tcp_position
+from planning.controllers.base import Goal, Observation
 from planning.controllers.learned import LearnedController
 from planning.costs import discounted_distance
 from planning.icem import ICEM, CostFunction
 from worldmodel.pixel_tracking import PixelTrack, uniform_pixels
-from worldmodel.tracking import hand_pixels
 
 
 class PixelController(LearnedController):
-    """Brings the TCP to a pixel by the predicted motion of the hand's pixels in the picture.
+    """Brings the point to a pixel by the predicted motion, in the picture, of the pixels around it.
 
-    Depth and the measured TCP serve to find the pixels of the hand, the same that T3VIP follows, and the pixel of the
-    TCP. The goal is a pixel; the point in space behind it is withheld.
+    Depth and where the point is now serve to find the pixels of its body, the same that T3VIP follows, and the pixel of
+    the point. The goal is a pixel; the point in space behind it is withheld.
 
     Args:
         name: of the model.
@@ -33,31 +33,39 @@ class PixelController(LearnedController):
         self.name = name
 
     def reset(self, observation: Observation, goal: Goal) -> None:
-        super().reset(observation, Goal(np.full(3, np.nan), goal.pixel))
+        super().reset(observation, replace(goal, point_world=np.full(3, np.nan)))
 
     def imagine(self, observation: Observation) -> CostFunction:
         state = self.observed()
-        start = PixelTrack.start(self.designated(observation), self.designated(self.frames[0]))
-        # The TCP is no pixel of the hand, it keeps a constant offset from their mean. As the hand's mean is to be that
-        # much beside the goal, the goal moves instead.
-        tcp = self.tensor(self.camera.project(self.camera.to_camera(tcp_position(observation))))
-        target = self.tensor(self.goal.pixel) - (tcp - start.expected_position()[0])
+        start = PixelTrack.start(self.distribution(self.designated[-1]), self.distribution(self.designated[0]))
+        # The point need be none of the pixels (the TCP is not), it keeps a constant offset from their mean. As the mean
+        # is to be that much beside the goal, the goal moves instead.
+        offset = self.pixel(self.follower.point) - start.expected_position()[0]
+        target = self.tensor(self.goal.pixel) - offset
 
         @torch.inference_mode()
         def cost(sequences: NDArray) -> NDArray:
             actions = self.tensor(self.aggregated(sequences))  # (N, h, A)
+            effector = self.pixel(self.effector.path(observation, sequences, self.hold))  # (N, h, 2)
             future, track = state, start
             distances = []
             for step in range(actions.shape[1]):
                 last = step + 1 == actions.shape[1]  # nobody looks at its picture
                 future, prediction = self.model.step(future, actions[:, step], paint=False, picture=not last)
                 track = track.advance(prediction)
-                distances.append(track.expected_distance(target))
+                distance = track.expected_distance(target)
+                if self.reach:
+                    point = track.expected_position() + offset
+                    distance = distance + self.reach * (point - effector[:, step]).norm(dim=-1)
+                distances.append(distance)
             return discounted_distance(torch.stack(distances, dim=1).cpu().numpy())
 
         return cost
 
-    def designated(self, observation: Observation) -> torch.Tensor:
-        """A uniform distribution (H, W) over the pixels of the hand."""
-        hand = hand_pixels(self.seen_points(observation), self.tcp_in_camera(observation), self.radius)
-        return uniform_pixels(hand, self.camera.height, self.camera.width)
+    def distribution(self, pixels: torch.Tensor) -> torch.Tensor:
+        """A uniform distribution (H, W) over pixels (M,)."""
+        return uniform_pixels(pixels.to(self.device), self.camera.height, self.camera.width)
+
+    def pixel(self, points: NDArray) -> torch.Tensor:
+        """Where points (..., 3) of the world appear in the picture, (..., 2)."""
+        return self.tensor(self.camera.project(self.camera.to_camera(points)))

@@ -87,7 +87,7 @@ def test_designated_are_the_pixels_of_the_hand_in_both_frames(pixel_model, camer
     controller.reset(observation, goal)
     for _ in range(4):
         observation = world.step(controller.act(observation))
-    before, now = (controller.designated(frame) for frame in (controller.frames[0], controller.frames[1]))
+    before, now = (controller.distribution(pixels) for pixels in controller.designated)
     assert now.sum() == pytest.approx(1) and 15 <= (now > 0).sum() <= 30
     assert not torch.equal(before, now)
 

@@ -1,0 +1,94 @@
+"""What a controller knows of the body that it moves: where proprioception says it is, and how it is told to move."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.planar_push import control as push_control
+from envs.planar_push.scene import TIP_HEIGHT
+from envs.tabletop import control as arm_control
+from planning.costs import env_action
+
+Array = NDArray[np.float64]
+Observation = dict[str, Any]
+
+TCP = slice(0, 3)  # position of the end-effector in `proprio` of the tabletop, metres, world
+GRIPPER = 14  # last gripper command in it
+
+
+class Effector:
+    """An end-effector that goes where it is told, along the world's x and y, or x, y and z.
+
+    Attributes:
+        axes: numbers in a move.
+        limit: the largest number in a planned move.
+        metres: that a move of 1 goes in one control step.
+        low, high: corners (3,) of the box that it stays in, metres.
+    """
+
+    axes: int
+    limit: float
+    metres: float
+    low: Array
+    high: Array
+
+    def reset(self, observation: Observation) -> None:
+        """Start an episode with its first observation."""
+
+    def position(self, observation: Observation) -> Array:
+        """Measured position (3,) in the world, metres."""
+        raise NotImplementedError
+
+    def action(self, move: NDArray) -> NDArray[np.float32]:
+        """Moves (..., axes) as actions (..., action_dim) of the environment."""
+        raise NotImplementedError
+
+    def path(self, observation: Observation, moves: NDArray, hold: int) -> Array:
+        """Where moves (N, h, axes), each held for `hold` control steps, take it if nothing is in the way: (N, h, 3)."""
+        ways = np.zeros((*moves.shape[:2], 3))
+        ways[..., : self.axes] = hold * self.metres * np.cumsum(moves, axis=1)
+        return np.clip(self.position(observation) + ways, self.low, self.high)
+
+
+class Arm(Effector):
+    """The arm of the tabletop: it is translated, never turned, and the gripper keeps its command of the start."""
+
+    axes, limit, metres = 3, 1.0, arm_control.ACTION_SCALE[0]
+    low, high = arm_control.WORKSPACE_LOW, arm_control.WORKSPACE_HIGH
+
+    def reset(self, observation: Observation) -> None:
+        self.gripper = held_gripper(observation)
+
+    def position(self, observation: Observation) -> Array:
+        return np.asarray(observation["proprio"][TCP], np.float64)
+
+    def action(self, move: NDArray) -> NDArray[np.float32]:
+        return env_action(move, self.gripper)
+
+
+class Tip(Effector):
+    """The tip of the planar pusher; the heading of a push is the direction of the move.
+
+    Its limit is half of what the environment allows. Pushes in the data are slower still, and the kernels of the
+    models of pictures reach about as far as the tip then goes in a frame gap of 3.
+    """
+
+    axes, limit, metres = 2, 0.5, push_control.ACTION_SCALE[0]
+    low = np.append(push_control.WORKSPACE_LOW, TIP_HEIGHT)
+    high = np.append(push_control.WORKSPACE_HIGH, TIP_HEIGHT)
+
+    def position(self, observation: Observation) -> Array:
+        return np.append(np.asarray(observation["proprio"][:2], np.float64), TIP_HEIGHT)
+
+    def action(self, move: NDArray) -> NDArray[np.float32]:
+        move = np.asarray(move, np.float32)
+        heading = np.arctan2(move[..., 1], move[..., 0]) * np.float32(1 / push_control.ACTION_SCALE[2])
+        return np.concatenate([move, heading[..., None]], axis=-1)
+
+
+def held_gripper(observation: Observation) -> float:
+    """The command, -1 or 1, that keeps the gripper as it is."""
+    return 1.0 if observation["proprio"][GRIPPER] >= 0 else -1.0

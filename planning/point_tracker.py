@@ -1,0 +1,177 @@
+"""Following a point of a thing on the table from frame to frame, by what the camera sees.
+
+The surface around the point in the first frame, as far as it hangs together, is a rigid piece of coloured point cloud.
+In each further frame that piece is put where its colours and depths agree best with what is seen there. It is always
+the first frame's piece, so that errors do not add up. Things on a table slide: the motion that is looked for is two
+numbers of translation along the table and one of rotation about the vertical.
+
+No model of the world and nothing of a simulator takes part. All controllers that plan with learned models follow
+their point with it.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from envs.camera import CameraModel
+
+Array = NDArray[np.float64]
+
+COLOUR_SCALE, DEPTH_SCALE = 0.06, 0.006  # differences, in [0, 1] and metres, beyond which a pixel counts as an outlier
+SURPRISE = np.array([0.015, 0.015, 0.15])  # m, m, rad: how far a motion may well be from that of the step before
+IN_FRONT = 0.015  # m; a point is hidden where what is seen is so much nearer, and says nothing then
+HIDDEN = 1.5  # disagreement of a hidden point: not nothing, lest the piece flee behind something
+POOR = 2.0  # mean disagreement of a point beyond which a fit may be a wrong one, and a wide search is made
+AGREES = 0.012  # m; a point of the piece is in sight where the depth seen is not farther off
+MIN_POINTS = 4  # of the piece that must be in sight to say where it is seen
+
+
+def grid(shift: float, turn: float, shifts: int, turns: int) -> Array:
+    """Motions (shifts * shifts * turns, 3) up to `shift` metres along x and y and `turn` radians, evenly spaced."""
+    along, around = np.linspace(-shift, shift, shifts), np.linspace(-turn, turn, turns)
+    return np.array(list(itertools.product(along, along, around)))
+
+
+NEARBY, WIDE = grid(0.018, 0.08, 5, 3), grid(0.045, 0.9, 9, 13)
+"""Motions of one step that are tried: what a push does, and what happens where the tip catches in a corner."""
+
+
+class PointTracker:
+    """Follows one point.
+
+    Args:
+        camera: geometry of the camera that takes the frames.
+        radius: metres around the point that the piece of surface extends at the most.
+        step: metres of depth from pixel to pixel beyond which a surface ends.
+    """
+
+    def __init__(self, camera: CameraModel, radius: float = 0.08, step: float = 0.01) -> None:
+        self.camera, self.radius, self.step = camera, radius, step
+
+    def reset(self, rgb: NDArray, depth: NDArray, point: Array) -> None:
+        """Begin with the first frame.
+
+        Args:
+            rgb: (H, W, 3) uint8.
+            depth: (H, W) metres.
+            point: (3,) metres, world frame, on a surface that the camera sees.
+        """
+        seen = self.camera.to_world(self.camera.unproject(depth))
+        piece = connected(depth, np.linalg.norm(seen - point, axis=-1), self.radius, self.step)
+        self._start = np.asarray(point, np.float64)
+        self._offsets = seen[piece] - self._start  # (M, 3)
+        self._colours = rgb[piece] / 255
+        self._motion, self._last = np.zeros(3), np.zeros(3)
+        self._depth = depth
+
+    def update(self, rgb: NDArray, depth: NDArray) -> None:
+        """Take in the next frame: (H, W, 3) uint8 and (H, W) metres."""
+        seen = np.dstack([rgb / 255, depth])
+        motion, poorness = self._fit(seen, NEARBY)
+        if poorness > POOR:
+            motion = min((motion, poorness), self._fit(seen, WIDE), key=lambda fit: fit[1])[0]
+        self._last, self._motion, self._depth = motion - self._motion, motion, depth
+
+    def _fit(self, seen: Array, tries: Array) -> tuple[Array, float]:
+        """The motion (3,) since the first frame that agrees best, and how badly it still does.
+
+        Args:
+            seen: (H, W, 4) colours in [0, 1] and depth of the new frame.
+            tries: (N, 3) motions since the last frame to start from.
+        """
+        expected = self._motion + self._last  # it goes on as it went
+
+        def disagreement(motion: Array) -> Array:
+            return self._disagreement(motion[None], seen, expected)[0]
+
+        starts = np.concatenate([expected[None], self._motion + tries])
+        start = starts[np.argmin(soft(self._disagreement(starts, seen, expected)).sum(axis=1))]
+        room = 2 * tries[-1] / (round(len(tries) ** (1 / 3)) - 1)  # to the neighbours of a start, or a bit more
+        found = least_squares(
+            disagreement, start, bounds=(start - room, start + room), loss="soft_l1", x_scale=SURPRISE, max_nfev=20,
+            xtol=1e-4, ftol=1e-4,
+        )  # fmt: skip
+        return found.x, 2 * found.cost / len(self._offsets)
+
+    @property
+    def point(self) -> Array:
+        """Where the point is now: (3,) metres, world frame."""
+        return self._start + np.append(self._motion[:2], 0.0)
+
+    def around(self, radius: float) -> Array:
+        """Points (M, 3) of the piece within `radius` of the point that are in sight now, metres, world frame.
+
+        All of those within it where next to none are in sight.
+        """
+        near = self._moved(self._motion[None])[0][np.linalg.norm(self._offsets, axis=-1) <= radius]
+        points = self.camera.to_camera(near)
+        u, v = np.rint(self.camera.project(points)).astype(int).T
+        inside = (u >= 0) & (v >= 0) & (u < self.camera.width) & (v < self.camera.height)
+        there = self._depth[v.clip(0, self.camera.height - 1), u.clip(0, self.camera.width - 1)]
+        visible = inside & (np.abs(there - points[:, 2]) <= AGREES)
+        return near[visible] if visible.sum() >= MIN_POINTS else near
+
+    def _moved(self, motions: Array) -> Array:
+        """The piece after each of some motions (N, 3), x, y and yaw: (N, M, 3), world frame."""
+        cos, sin, zero = np.cos(motions[:, 2]), np.sin(motions[:, 2]), np.zeros(len(motions))
+        turns = np.stack([cos, sin, zero, -sin, cos, zero, zero, zero, zero + 1], axis=-1).reshape(-1, 3, 3)
+        shifts = np.column_stack([motions[:, :2], zero])
+        return self._start + shifts[:, None] + self._offsets @ turns
+
+    def _disagreement(self, motions: Array, seen: Array, expected: Array) -> Array:
+        """What disagrees after each of some motions (N, 3): colours, depths, and how surprising it is: (N, 4 M + 3)."""
+        points = self.camera.to_camera(self._moved(motions))
+        there = read(seen, self.camera.project(points))
+        colours = (there[..., :3] - self._colours) / COLOUR_SCALE
+        depths = (there[..., 3] - points[..., 2]) / DEPTH_SCALE
+        hidden = there[..., 3] < points[..., 2] - IN_FRONT
+        colours, depths = np.where(hidden[..., None], 0.0, colours), np.where(hidden, HIDDEN, depths)
+        surprise = (motions - expected) / SURPRISE * np.sqrt(len(self._offsets)) / 2
+        return np.concatenate([colours.reshape(len(motions), -1) / np.sqrt(3), depths, surprise], axis=1)
+
+
+def soft(residuals: Array) -> Array:
+    """SciPy's `soft_l1` loss: squares of small numbers, sizes of large ones."""
+    return 2 * (np.sqrt(1 + residuals**2) - 1)
+
+
+def read(picture: Array, pixels: Array) -> Array:
+    """The values of a picture (H, W, C) between pixels (..., 2) u, v, linearly: (..., C). Its edge goes on outside."""
+    height, width = picture.shape[:2]
+    u, v = np.clip(pixels[..., 0], 0, width - 1), np.clip(pixels[..., 1], 0, height - 1)
+    left, top = np.minimum(u.astype(int), width - 2), np.minimum(v.astype(int), height - 2)
+    along, down = (u - left)[..., None], (v - top)[..., None]
+    upper = picture[top, left] * (1 - along) + picture[top, left + 1] * along
+    lower = picture[top + 1, left] * (1 - along) + picture[top + 1, left + 1] * along
+    return upper * (1 - down) + lower * down
+
+
+def connected(depth: NDArray, distance: NDArray, radius: float, step: float) -> NDArray[np.bool_]:
+    """The pixels of one surface.
+
+    Args:
+        depth: (H, W) metres.
+        distance: (H, W) metres from the point to what each pixel sees; the surface is that of the least.
+        radius: where the surface is cut off, metres.
+        step: depth from a pixel to its neighbour beyond which they are of two surfaces, metres.
+
+    Returns:
+        (H, W) bool; at least one pixel.
+    """
+    seed = tuple(int(i) for i in np.unravel_index(np.argmin(distance), distance.shape))
+    inside = np.zeros(depth.shape, bool)
+    inside[seed] = True
+    todo = [seed]
+    while todo:
+        row, column = todo.pop()
+        for at in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
+            if not (0 <= at[0] < depth.shape[0] and 0 <= at[1] < depth.shape[1]) or inside[at]:
+                continue
+            if distance[at] <= radius and abs(depth[at] - depth[row, column]) <= step:
+                inside[at] = True
+                todo.append(at)
+    return inside
