@@ -14,10 +14,12 @@ from envs.errors import UsageError
 
 REACH_S = 5.0
 """How long to wait for a cluster's address to answer; Ray itself would try for minutes."""
+TRIES = 3
+"""Ray gives a cluster of its own 30 s to start, which a busy machine may exceed."""
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",  # nothing is sent anywhere
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # a task without GPUs leaves CUDA_VISIBLE_DEVICES alone; Ray's new way
-    "RAY_TQDM": "0",
+    "RAY_worker_niceness": "0",  # as nice as this process, not by 15 nicer than whatever else runs
 }
 
 
@@ -42,16 +44,22 @@ def connect(address: str | None, cpus: int | None) -> Iterator[None]:
     import ray  # takes seconds: only for those who use it
 
     on_sigterm = signal.getsignal(signal.SIGTERM)
-    try:
-        if address is None:
-            ray.init("local", num_cpus=cpus, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
-        else:
-            ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        where = "Ray does not start here" if address is None else f"cannot join the Ray cluster at '{address}'"
-        raise UsageError(
-            f"{where} ({str(error).splitlines()[0]}); see what ray start --head says, or leave out --ray"
-        ) from error
+    for attempt in range(1, TRIES + 1):
+        try:
+            if address is None:
+                ray.init(
+                    "local", num_cpus=cpus, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR
+                )
+            else:
+                ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
+            break
+        except Exception as error:  # Ray raises plain ones here
+            ray.shutdown()
+            if address is None and attempt < TRIES:
+                continue
+            where = "Ray does not start here" if address is None else f"cannot join the Ray cluster at '{address}'"
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise UsageError(f"{where} ({reason}); see what ray start --head says, or leave out --ray") from error
     if callable(on_sigterm) and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, on_sigterm)  # a cluster of our own has put its handler in that place
     try:
