@@ -18,7 +18,7 @@ from envs.errors import UsageError
 from envs.planar_push import PlanarPushEnv
 
 PUSH_STEPS = 12  # control steps; frames of a push of Omnipush
-STRIDE = 0.0125  # m a control step on the way round: no faster than pushes of 0.4 s, so that a gap of 3 stays within 4 px
+STRIDE = 0.0125  # m a control step on the way round: no faster than pushes of 0.4 s, so a gap of 3 stays within 4 px
 
 
 class PushPolicy:
