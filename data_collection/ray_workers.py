@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import ray
-from ray.exceptions import RayError
+from ray.exceptions import ActorDiedError, ActorUnavailableError, RayError
 
 from data_collection.episodes import EpisodeMaker
 from data_collection.files import written_aside
@@ -178,6 +178,8 @@ class RayWorker(Worker):
 
 def _describe_death(error: RayError) -> str:
     said = str(error)
-    if "node" in said and "died" in said:
-        return "its machine left the cluster"
-    return f"its process died ({type(error).__name__})"
+    if isinstance(error, ActorDiedError):
+        return "its machine left the cluster" if "its node has died" in said else "its process died"
+    if isinstance(error, ActorUnavailableError):
+        return "it cannot be reached any more"
+    return f"{type(error).__name__}: {said.splitlines()[0]}"

@@ -101,7 +101,8 @@ def nearest_in_window(query: Tensor, reference: Tensor, radius: int) -> Tensor:
         where = where.long()
         y = torch.arange(height, device=query.device).view(-1, 1) + where // window - radius
         x = torch.arange(width, device=query.device) + where % window - radius
-        return y * width + x
+        # Beside points that are not finite even the edge beyond the picture is near.
+        return y.clamp(0, height - 1) * width + x.clamp(0, width - 1)
 
 
 @compiled

@@ -34,10 +34,11 @@ def main(options: TrainOptions) -> None:
     keep_freed_memory()
     prepare_devices(options.deterministic)
     with join_ranks(options.device) as ranks:
-        _train(options, ranks)
+        train_with(ranks, options)
 
 
-def _train(options: TrainOptions, ranks: Ranks) -> None:
+def train_with(ranks: Ranks, options: TrainOptions) -> None:
+    """Train as one of several processes, which all call this."""
     ranks.share(options.batch)  # refuse an odd one before the data is read
     train, validation = open_data(options)
 

@@ -64,6 +64,14 @@ def test_chamfer_is_knn_with_the_whole_picture_for_a_window():
     assert narrow > 1.1 * answers[0][0]  # what a window misses
 
 
+def test_a_cloud_that_is_no_number_gives_a_loss_that_is_none():
+    moved, target = clouds(2, 6, 8, 1)
+    for query, reference in ((moved, target * torch.nan), (moved * torch.nan, target)):
+        assert losses.nearest_in_window(query, reference, 2).max() < 6 * 8
+        assert losses.nearest_in_window(query, reference, 2).min() >= 0
+        assert losses.knn_alignment(query, reference, 2).isnan()
+
+
 def test_gradient_of_the_alignment_is_right_and_finite_where_points_coincide():
     moved, target = clouds(2, 3, 4, 1)
     assert torch.autograd.gradcheck(lambda x: losses.knn_alignment(x, target, 1), (moved.requires_grad_(),))
