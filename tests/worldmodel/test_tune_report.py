@@ -1,0 +1,126 @@
+"""`tune-report`: known rank correlations, the winner, and pictures, from hand-made results."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from envs.command import run
+from worldmodel.train import parse_options
+from worldmodel.tune_report import ReportOptions, main
+from worldmodel.tuning import journal
+from worldmodel.tuning.report import FILES
+from worldmodel.tuning.space import WEIGHTS
+
+BUDGETS = (3, 9, 27)
+NAMES = ("learning_rate", *(axis.name for axis in WEIGHTS))
+SCORES = {  # trial -> its scores at the budgets that it reached
+    0: (30.0, 33.0, 37.0),
+    1: (31.0, 34.0, 36.0),
+    2: (32.0, 35.0, 40.0),
+    3: (33.0, 37.0, 39.0),
+    4: (34.0, 36.0, 38.5),
+    5: (29.0,),
+    6: (35.0, 32.0),
+}
+# Ranks of trials 0 to 4: 1 2 3 4 5; 1 2 3 5 4; 2 1 5 4 3. r = 1 - 6 sum d^2 / (n (n^2 - 1)), n = 5.
+EXPECTED = {(3, 9): 0.9, (3, 27): 0.5, (9, 27): 0.6}
+
+
+def point(number):
+    rng = np.random.default_rng(number)
+    values = {name: float(10 ** rng.uniform(-3, 0)) for name in NAMES}
+    return values | {"learning_rate": 1e-4 * (number + 1), "power": 1 + number % 2}
+
+
+@pytest.fixture
+def out(tmp_path):
+    """A search of seven trials, five of them unpruned; one was stopped, one diverged, an eighth failed."""
+    settings = {
+        "options": {"trials": 9, "unpruned": 5, "searcher": "random"},
+        "shared": {"preset": "tiny", "model": "t3vip", "frame_gap": 2, "losses": {"knn_radius": 3}},
+        "budgets": BUDGETS,
+        "axes": {name: [3e-5, 1e-3] if name == "learning_rate" else [1e-3, 1.0] for name in NAMES},
+    }
+    (tmp_path / "tune.json").write_text(json.dumps(settings))
+    results = tmp_path / journal.JOURNAL
+    for number, scores in SCORES.items():
+        journal.append(results, {"kind": "begin", "trial": number, "point": point(number)})
+        for step, score in zip(BUDGETS, scores, strict=False):
+            journal.append(results, {"kind": "score", "trial": number, "step": step, "score": score})
+            journal.append(results, {"kind": "score", "trial": number, "step": step, "score": score})  # told twice
+        status = {1: "stopped", 2: "diverged", 3: "finished"}[len(scores)]
+        journal.append(results, {"kind": "end", "trial": number, "status": status, "reason": ""})
+    journal.append(results, {"kind": "death", "trial": 3, "reason": "killed"})
+    journal.append(results, {"kind": "begin", "trial": 7, "point": point(7)})
+    journal.append(results, {"kind": "end", "trial": 7, "status": "failed", "reason": "killed"})
+    return tmp_path
+
+
+def report(out):
+    run(ReportOptions, main, [str(out)])
+    return json.loads((out / "report.json").read_text())
+
+
+def test_rank_correlations_are_spearmans_with_counts(out):
+    document = report(out)
+    unpruned = {tuple(pair["budgets"]): pair for pair in document["rank_correlation"]["unpruned"]}
+    assert {pair: found["r"] for pair, found in unpruned.items()} == pytest.approx(EXPECTED)
+    assert {found["n"] for found in unpruned.values()} == {5}
+    assert unpruned[3, 9]["p"] == pytest.approx(0.0374, abs=1e-4) and unpruned[3, 27]["p"] > 0.3
+    every = {tuple(pair["budgets"]): pair for pair in document["rank_correlation"]["all"]}
+    assert {pair: found["n"] for pair, found in every.items()} == {(3, 9): 6, (3, 27): 5, (9, 27): 5}
+    assert every[3, 9]["r"] < 0.5  # the one that diverged fell from the first place to the last
+    assert document["shown_of"] == "unpruned"
+
+
+def test_the_best_of_those_that_ran_to_the_end_is_what_train_worldmodel_takes(out):
+    document = report(out)
+    assert document["best"] == 2 and document["gain"] == pytest.approx(3.0)
+    assert document["trials"][3]["deaths"] == 1 and document["trials"][7]["status"] == "failed"
+    options = parse_options(["--data", "d", "--out", "o", "--config", str(out / "best.json")])
+    assert (options.preset, options.frame_gap, options.losses.knn_radius) == ("tiny", 2, 3)
+    assert options.learning_rate == pytest.approx(3e-4) and options.losses.power == 1
+    for axis in WEIGHTS:
+        assert getattr(options.losses, axis.name) == point(2)[axis.name]
+    text = (out / "report.md").read_text()
+    assert "trial 2, 40.00 dB, +3.00 dB against trial 0" in text and "| 3 and 9 | 0.900 | 0.037 | 5 |" in text
+
+
+def test_pictures(out):
+    document = report(out)
+    for name in ("trials.png", "rank-correlation.png"):
+        with Image.open(out / name) as picture:
+            assert np.asarray(picture.convert("L")).std() > 10, name
+    assert all((out / name).exists() for name in FILES) and len(document["trials"]) == 8
+
+
+def test_an_unfinished_search_has_a_report_of_what_there_is(out):
+    results = out / journal.JOURNAL
+    lines = results.read_text().splitlines()
+    results.write_text("\n".join(lines[:4]) + '\n{"kind": "sco')  # trial 0 under way, and a torn line
+    document = report(out)
+    assert document["best"] is None and [trial["status"] for trial in document["trials"]] == ["running"]
+    assert not (out / "best.json").exists() and not (out / "rank-correlation.png").exists()
+    journal.append(results, {"kind": "score", "trial": 0, "step": 27, "score": 36.0})
+    assert report(out)["best"] == 0  # what comes after a torn line counts
+
+
+def test_a_trial_that_was_drawn_anew_forgets_its_scores(out):
+    results = out / journal.JOURNAL
+    journal.append(results, {"kind": "begin", "trial": 2, "point": point(12)})
+    (trial,) = (trial for trial in journal.trials(results) if trial.number == 2)
+    assert not trial.scores and trial.status == "running" and trial.point == point(12)
+
+
+@pytest.mark.parametrize(
+    ("content", "word"), [(None, "no search in"), ("{}", "is damaged"), ("{", "is damaged"), ("[]", "is damaged")]
+)
+def test_what_is_no_search(tmp_path, capsys, content, word):
+    if content is not None:
+        (tmp_path / "tune.json").write_text(content)
+    with pytest.raises(SystemExit) as stop:
+        run(ReportOptions, main, [str(tmp_path)])
+    lines = capsys.readouterr().err.splitlines()
+    assert stop.value.code == 2 and len(lines) == 1 and word in lines[0]
