@@ -30,7 +30,8 @@ def torchrun(*arguments):
     process = subprocess.Popen(
         [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", *map(str, arguments)],
         env={**os.environ, **variables},
-        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
         text=True,
     )
     try:
@@ -65,8 +66,8 @@ def together(tiny_dataset, folder, alone):
     """What `ddp_program` leaves: the same run by two, and the end of the run of one by two."""
     without_end(alone, folder / "continued")
     with torchrun(HERE / "ddp_program.py", tiny_dataset, folder, *OPTIONS) as process:
-        _, err = process.communicate(timeout=230)
-    assert process.returncode == 0, err
+        said, _ = process.communicate(timeout=230)
+    assert process.returncode == 0, said
     return folder / "together"
 
 
@@ -138,12 +139,12 @@ def test_sigterm_to_torchrun_saves(tiny_dataset, tmp_path):
     given = ["--preset", "tiny", "--steps", 5000, "--save-every", 5000, "--validate-every", 5000, "--batch", 2]
     with torchrun("-m", "worldmodel.train", "--data", tiny_dataset, "--out", tmp_path, *given) as process:
         while not (tmp_path / "metrics.jsonl").exists():
-            assert process.poll() is None, process.communicate()[1]
+            assert process.poll() is None, process.communicate()[0]
             time.sleep(0.05)
         process.send_signal(signal.SIGTERM)
-        _, err = process.communicate(timeout=230)
+        said, _ = process.communicate(timeout=230)
     (saved,) = (int(path.name.removeprefix("step-")) for path in (tmp_path / "checkpoints").glob("step-*"))
-    assert err.count(f"stopped at step {saved}") == 1 and saved == lines(tmp_path, "train")[-1]["step"], err
+    assert said.count(f"stopped at step {saved}") == 1 and saved == lines(tmp_path, "train")[-1]["step"], said
 
 
 def test_shares_of_a_batch():
