@@ -26,8 +26,6 @@ STEP_S = 0.1
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
     """Two nodes with a CPU each, the second of which is to be killed; episode 2 of seed 0 kills its process, once."""
-    from ray.cluster_utils import Cluster
-
     fault = {
         "STANDIN_FAULT": "kill",
         "STANDIN_EPISODE": reset_seed(0, 2),
@@ -36,10 +34,25 @@ def cluster(tmp_path_factory):
         "PYTHONPATH": f"{HERE}{os.pathsep}{ROOT}",
     }
     with mock.patch.dict(os.environ, {**QUIET, **{name: str(value) for name, value in fault.items()}}):
-        nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-        nodes.add_node(num_cpus=1)
+        nodes = started_nodes()
     yield nodes
     nodes.shutdown()
+
+
+def started_nodes(tries=3):
+    """Ray gives a node 30 s to start, which a busy machine may exceed."""
+    from ray.cluster_utils import Cluster
+
+    for attempt in range(tries):
+        nodes = Cluster()
+        try:
+            nodes.add_node(num_cpus=1, include_dashboard=False)
+            nodes.add_node(num_cpus=1)
+            return nodes
+        except Exception:
+            nodes.shutdown()
+            if attempt == tries - 1:
+                raise
 
 
 def shards(folder):
