@@ -33,6 +33,9 @@ class ModelConfig:
     """How points that land on the same pixel share it: `over` lays the nearer over the farther."""
     splat_sharpness: float = 3.0
     """Of splat `softmax`, in 1/metre."""
+    first_shift: float = 0.0
+    """T3VIP's transforms start out with shifts of about so many pixels, each its own, that depend on the action; 0
+    starts with the identity, as the paper. Where a hundredth of the picture moves, 1 finds the motion far sooner."""
     mask_head_std: float = 0.5
     """Initial spread of the mask head's weights. Masks that start out alike never come apart."""
 
@@ -45,6 +48,8 @@ class ModelConfig:
             raise UsageError(f"kernel-size is {self.kernel_size}; give an odd number such as 5 or 9")
         if self.masks < 2:
             raise UsageError(f"masks is {self.masks}; give at least 2 (a background and one that moves)")
+        if self.first_shift < 0:
+            raise UsageError(f"first-shift is {self.first_shift}; give pixels, 0 or more")
         if self.splat_sharpness < 0:
             raise UsageError(f"splat-sharpness is {self.splat_sharpness}; give 0 or more")
 

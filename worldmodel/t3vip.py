@@ -51,11 +51,21 @@ class CloudPrediction(Prediction):
 
 
 class TransformHead(nn.Module):
-    """Motion embedding and action to K - 1 rigid transforms, the identity at initialisation."""
+    """Motion embedding and action to K - 1 rigid transforms.
+
+    At initialisation none of them turns, and each is shifted by the action in a direction of its own.
+
+    Args:
+        inputs: numbers in a motion embedding.
+        action_dim: numbers in an action; without any, each transform starts with a shift that is always the same.
+        count: of transforms.
+        width: multiplier on the channels.
+        shift: standard deviation of the first shifts along each axis, under actions as they usually are, metres.
+    """
 
     identity: Tensor
 
-    def __init__(self, inputs: int, action_dim: int, count: int, width: float) -> None:
+    def __init__(self, inputs: int, action_dim: int, count: int, width: float, shift: float) -> None:
         super().__init__()
         wide, narrow = scaled(256, width), scaled(128, width)
         self.first = nn.Linear(inputs, wide)
@@ -63,6 +73,10 @@ class TransformHead(nn.Module):
         self.last = nn.Linear(narrow + action_dim, 9 * count)
         nn.init.uniform_(self.last.weight, -1e-4, 1e-4)
         nn.init.zeros_(self.last.bias)
+        if shift:
+            by_action, always = self.last.weight.data[:, narrow:], self.last.bias.data[:, None]
+            shifts = (by_action if action_dim else always).unflatten(0, (count, 9))[:, :3]
+            shifts.normal_(0.0, shift / max(1, action_dim) ** 0.5)
         self.register_buffer("identity", torch.tensor([1.0, 0, 0, 0, 1.0, 0]), persistent=False)
 
     def forward(self, embedding: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -104,7 +118,9 @@ class T3VIP(WorldModel):
         height, width = self.camera.height, self.camera.width
         self.mask_decoder = Decoder(config.masks, config)
         self.inpainter = Decoder(4, config)
-        self.transforms = TransformHead(self.embedding_size, self.action_dim, config.masks - 1, config.width)
+        pixel = (self.camera.near + self.camera.far) / 2 / float(self.camera.K[0, 0])  # metres, half way to the back
+        shift = config.first_shift * pixel
+        self.transforms = TransformHead(self.embedding_size, self.action_dim, config.masks - 1, config.width, shift)
         nn.init.normal_(self.mask_decoder.head.weight, std=config.mask_head_std)
 
         intrinsics = torch.from_numpy(np.array(self.camera.K)).float()

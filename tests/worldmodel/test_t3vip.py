@@ -38,6 +38,20 @@ def test_an_untrained_model_copies(make_model, clips):
 
 
 @torch.no_grad()
+def test_first_shifts_follow_the_action_each_its_own_way(make_model, clips):
+    model = make_model(moving=False, masks=10, first_shift=2.0)
+    embedding = torch.zeros(1000, model.embedding_size)
+    actions = torch.randn(1000, model.action_dim, generator=torch.Generator().manual_seed(0))
+    rotation, shift = model.transforms(embedding, actions)
+    pixel = (model.camera.near + model.camera.far) / 2 / model.camera.K[0, 0]
+    assert 1.0 < shift.std() / pixel < 3.0  # 2 pixels, give or take the luck of few directions
+    directions = torch.corrcoef(shift[:, :, 0].T)
+    assert directions.fill_diagonal_(0).abs().max() < 0.999  # no two masks move alike
+    torch.testing.assert_close(rotation, torch.eye(3).expand_as(rotation), atol=0.01, rtol=0)
+    assert model.transforms(embedding[:1], 0 * actions[:1])[1].abs().max() < 0.02 * pixel
+
+
+@torch.no_grad()
 def test_without_transforms_any_model_copies(model, clips):
     rollout = unroll(model, clips, context=2, still=True)
     for t, prediction in enumerate(rollout.predictions):
