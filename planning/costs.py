@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
+
+ArrayOrTensor = TypeVar("ArrayOrTensor", NDArray[np.float64], Tensor)
 
 
 def discounted_distance(distances: NDArray, discount: float = 0.95) -> NDArray[np.float64]:
@@ -34,3 +40,32 @@ def env_action(move: NDArray, gripper: float, dim: int = 7) -> NDArray[np.float3
     action[..., :3] = move
     action[..., -1] = gripper
     return action
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Draws the end-effector to where it can push the point towards its goal: beyond the point, as seen from there.
+
+    What is not touched does not move, whatever is done elsewhere: without this, all plans that do not come to touch the
+    thing in time would cost the same.
+    """
+
+    weight: float
+    """of that distance beside the point's to its goal"""
+    beyond: float
+    """metres behind the point"""
+    near: float = 0.02
+    """metres from the goal at which the place is but half as far behind the point; at the goal it is the point itself"""
+
+    def cost(
+        self, effector: ArrayOrTensor, point: ArrayOrTensor, goal: ArrayOrTensor, per_metre: float = 1.0
+    ) -> ArrayOrTensor:
+        """Weighted distances (...) of end-effectors (..., D) for points (..., D) on their way to a goal (D,).
+
+        Args:
+            per_metre: what a metre is in the unit of the places: 1, or pixels for places in the picture.
+        """
+        way = point - goal
+        length = ((way**2).sum(-1) ** 0.5)[..., None]
+        place = point + self.beyond * per_metre * way / (length + self.near * per_metre)
+        return self.weight * ((effector - place) ** 2).sum(-1) ** 0.5

@@ -39,14 +39,16 @@ class Studio:
 
     Args:
         env: the environment; it is only looked at.
+        zoom: how many times as large things are shown, around the middle of the picture.
     """
 
-    def __init__(self, env: gym.Env) -> None:
+    def __init__(self, env: gym.Env, zoom: float = 1.0) -> None:
         inner: Any = env.unwrapped
         self.env, self.inner = env, inner
         self.steps_per_frame = -(-int(inner.control_rate) // MOST_FPS)
         model, near, far = inner.mj_model, inner.camera.near, inner.camera.far
-        self.cameras = [StaticCamera(model, view, SIZE, SIZE, near, far) for view in VIEWS]
+        large = 2 * round(zoom * SIZE / 2)
+        self.cameras = [StaticCamera(model, view, large, large, near, far) for view in VIEWS]
 
     def close(self) -> None:
         """Free the cameras."""
@@ -81,7 +83,9 @@ class Film:
         self.frames.append(_captioned(np.concatenate(views, axis=1), text))
 
     def _view(self, camera: StaticCamera) -> NDArray[np.uint8]:
-        picture = Image.fromarray(camera.render(self._studio.inner.mj_data)[0])
+        margin = _margin(camera.geometry)
+        shown = slice(margin, margin + SIZE)
+        picture = Image.fromarray(camera.render(self._studio.inner.mj_data)[0][shown, shown])
         way = _pixels(camera.geometry, np.array(self._path))
         u, v = _pixels(camera.geometry, self._setup.goal.point_world[None])[0]
         _draw_lines(picture, [way], POINT_COLOUR, 1)
@@ -101,9 +105,14 @@ class Film:
             iio.imwrite(aside, np.concatenate(rows, axis=1), extension=".png")
 
 
+def _margin(camera: CameraModel) -> int:
+    """Pixels on each side that are not shown."""
+    return (camera.width - SIZE) // 2
+
+
 def _pixels(camera: CameraModel, points: NDArray) -> list[tuple[float, float]]:
-    """World points (N, 3) as pixels, kept near the picture."""
-    pixels = np.nan_to_num(camera.project(camera.to_camera(points)))
+    """World points (N, 3) as pixels of what is shown, kept near it."""
+    pixels = np.nan_to_num(camera.project(camera.to_camera(points))) - _margin(camera)
     return [(float(u), float(v)) for u, v in np.clip(pixels, -SIZE, 2 * SIZE)]
 
 

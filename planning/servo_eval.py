@@ -133,7 +133,7 @@ def main(config: ServoConfig) -> None:
     keep_freed_memory()
     task = config.task
     env = task.make_env(config.scene, config.image_size)
-    studio = Studio(env)
+    studio = Studio(env, task.zoom)
     kit = Kit(env, config.planner, config.hold, config.checkpoints(), config.device, config.deadline)
     kit.body, kit.surface, kit.reach = task.body, task.surface, task.reach
     try:
@@ -168,7 +168,11 @@ def settings(config: ServoConfig, hold: int, learned: dict[str, Any]) -> dict[st
     """What an episode's outcome depends on, apart from its model, setup and repeat."""
     kept = {name: getattr(config, name) for name in ("scene", "steps", "seed", "image_size", "deadline")}
     if config.task.surface is not None:  # the hand's folders are older and do not say
-        kept |= {"env": config.env, "point": config.point, "reach": config.task.reach}
+        kept |= {
+            "env": config.env,
+            "point": config.point,
+            "reach": asdict(config.task.reach) if config.task.reach else None,
+        }
     weights = {name: weights_hash(model) for name, model in learned.items()}
     return {**kept, "hold": hold, "planner": asdict(config.planner), "checkpoints": weights}
 

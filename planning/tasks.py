@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from planning.costs import Reach
 from planning.drawer_setups import make_drawer_setup
 from planning.effectors import Arm, Effector, Tip
 from planning.followers import Surface
@@ -28,9 +29,10 @@ class Task:
         where: what stands in titles; `{scene}` for the scene.
         body: what is moved.
         surface: what the point lies on; None for the end-effector's own point.
-        reach: weight of the end-effector's distance to the point, see `PlanningController`.
+        reach: draws the end-effector to the thing that the point is on.
         steps: usual budget of control steps.
         planner: usual search.
+        zoom: of films.
     """
 
     env_id: str
@@ -40,9 +42,10 @@ class Task:
     scene_keyword: str = ""
     body: type[Effector] = Arm
     surface: Surface | None = None
-    reach: float = 0.0
+    reach: Reach | None = None
     steps: int = 100
     planner: ICEMConfig = field(default_factory=ICEMConfig)
+    zoom: float = 1.0
 
     def make_env(self, scene: str, image_size: int) -> gym.Env:
         """The environment, without a time limit."""
@@ -62,12 +65,12 @@ TASKS: dict[tuple[str, str], Task] = {
     ),
     ("tabletop", "drawer"): Task(
         "t3vip/Tabletop{scene}-v0", ("D", "A", "B", "C"), make_drawer_setup, "drawer of scene {scene}",
-        surface=Surface(extent=0.08, step=0.03, radius=0.05), reach=0.3, planner=ICEMConfig(horizon=5),
+        surface=Surface(extent=0.08, step=0.03, radius=0.05), reach=Reach(0.3, 0.034), planner=ICEMConfig(horizon=5),
     ),
     ("planar-push", "object"): Task(
         "t3vip/PlanarPush-v0", ("test", "validation", "train", "all"), make_push_setup, "push {scene} objects",
-        scene_keyword="split", body=Tip, surface=Surface(extent=0.08, step=0.01, radius=0.025), reach=0.1,
-        planner=ICEMConfig(horizon=6),
+        scene_keyword="split", body=Tip, surface=Surface(extent=0.08, step=0.01, radius=0.025), reach=Reach(0.15, 0.1),
+        planner=ICEMConfig(horizon=6), zoom=1.5,
     ),
 }  # fmt: skip
 """Environment and point -> the task; the first point of an environment is the usual one."""

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.costs import Reach
 from planning.effectors import Arm, Effector, Observation, held_gripper
 from planning.followers import EffectorFollower, Follower
 from planning.goals import Goal
@@ -80,9 +81,7 @@ class PlanningController(HoldingController):
     Args:
         planner: searches sequences of moves.
         hold, effector, follower: see `HoldingController`.
-        reach: weight of the end-effector's distance to the point beside the point's to the goal. What is not touched
-            does not move, whatever is done elsewhere: without this, all plans that do not come to touch the thing in
-            time would cost the same.
+        reach: draws the end-effector to the thing that the point is on, if given.
     """
 
     def __init__(
@@ -91,7 +90,7 @@ class PlanningController(HoldingController):
         hold: int,
         effector: Effector | None = None,
         follower: Follower | None = None,
-        reach: float = 0.0,
+        reach: Reach | None = None,
     ) -> None:
         super().__init__(hold, effector, follower)
         self.planner, self.reach = planner, reach

@@ -91,7 +91,7 @@ class LinearController(PlanningController):
             distances = np.linalg.norm(positions - self.goal.point_world, axis=-1)
             if self.reach:
                 effector = self.effector.path(observation, sequences, self.hold)
-                distances = distances + self.reach * np.linalg.norm(positions - effector, axis=-1)
+                distances = distances + self.reach.cost(effector, positions, self.goal.point_world)
             return discounted_distance(distances)
 
         return cost

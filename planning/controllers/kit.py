@@ -11,6 +11,7 @@ import numpy as np
 
 from envs.camera import CameraModel
 from envs.errors import UsageError
+from planning.costs import Reach
 from planning.effectors import Arm, Effector
 from planning.followers import EffectorFollower, Follower, Surface, SurfaceFollower
 from planning.icem import ICEM, ICEMConfig
@@ -35,7 +36,7 @@ class Kit:
         deadline: seconds after which a plan must be there, if any.
         body: what is moved.
         surface: what the designated point lies on; None if it is the end-effector's own.
-        reach: weight of the end-effector's distance to the point, see `PlanningController`.
+        reach: draws the end-effector to the thing that the point is on, if given.
         rng: randomness of the next controller that is made.
         mark: where the designated point of the next episode truly is, for the oracle; None if it is the end-effector's.
     """
@@ -48,7 +49,7 @@ class Kit:
     deadline: float | None = None
     body: type[Effector] = Arm
     surface: Surface | None = None
-    reach: float = 0.0
+    reach: Reach | None = None
     rng: np.random.Generator = field(default_factory=np.random.default_rng)
     mark: Mark | None = None
     _models: dict[str, Any] = field(default_factory=dict, init=False, repr=False)

@@ -39,7 +39,7 @@ class OracleController(PlanningController):
             effector, point = paths.effector[:, after], paths.point[:, after]  # (N, h, 3)
             distances = np.linalg.norm(point - self.goal.point_world, axis=-1)
             if self.reach:
-                distances = distances + self.reach * np.linalg.norm(effector - point, axis=-1)
+                distances = distances + self.reach.cost(effector, point, self.goal.point_world)
             return discounted_distance(distances)
 
         return cost

@@ -41,7 +41,9 @@ class PixelController(LearnedController):
         # The point need be none of the pixels (the TCP is not), it keeps a constant offset from their mean. As the mean
         # is to be that much beside the goal, the goal moves instead.
         offset = self.pixel(self.follower.point) - start.expected_position()[0]
-        target = self.tensor(self.goal.pixel) - offset
+        goal = self.tensor(self.goal.pixel)
+        target = goal - offset
+        per_metre = float(self.camera.K[0, 0] / self.camera.to_camera(self.follower.point)[2])  # pixels
 
         @torch.inference_mode()
         def cost(sequences: NDArray) -> NDArray:
@@ -55,8 +57,8 @@ class PixelController(LearnedController):
                 track = track.advance(prediction)
                 distance = track.expected_distance(target)
                 if self.reach:
-                    point = track.expected_position() + offset
-                    distance = distance + self.reach * (point - effector[:, step]).norm(dim=-1)
+                    place = track.expected_position() + offset
+                    distance = distance + self.reach.cost(effector[:, step], place, goal, per_metre)
                 distances.append(distance)
             return discounted_distance(torch.stack(distances, dim=1).cpu().numpy())
 

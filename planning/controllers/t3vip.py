@@ -37,7 +37,7 @@ class T3VIPController(LearnedController):
                 track = track.advance(prediction.transform, prediction.masks[:, :1])
                 distance = (track.tcp - goal).norm(dim=-1)
                 if self.reach:
-                    distance = distance + self.reach * (track.tcp - effector[:, step]).norm(dim=-1)
+                    distance = distance + self.reach.cost(effector[:, step], track.tcp, goal)
                 distances.append(distance)
             return discounted_distance(torch.stack(distances, dim=1).cpu().numpy())
 

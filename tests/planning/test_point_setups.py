@@ -10,10 +10,10 @@ import pytest
 from planning import servo_eval
 from planning.controllers import CONTROLLERS, Kit
 from planning.drawer_setups import BEHIND, make_drawer_setup
-from planning.effectors import Tip
 from planning.episode import run_episode
 from planning.icem import ICEMConfig
 from planning.push_setups import FARTHEST, NEAREST, make_push_setup
+from planning.tasks import TASKS
 from planning.what_if import what_if
 from worldmodel import checkpoint
 
@@ -82,8 +82,8 @@ def test_drawer_setups_are_what_they_promise(table):
 def test_the_oracle_pushes_a_point_to_its_goal_as_its_simulator_says(push):
     setup = next(setup for setup in (make_push_setup(push, i) for i in range(20)) if setup.part == "behind")
     kit = Kit(push, ICEMConfig(horizon=5, population=16, iterations=2, elites=4), rng=np.random.default_rng(0))
-    kit.body, kit.reach, kit.mark = Tip, 0.1, setup.mark
-    kit.surface = servo_eval.TASKS["planar-push", "object"].surface
+    task = TASKS["planar-push", "object"]
+    kit.body, kit.reach, kit.surface, kit.mark = task.body, task.reach, task.surface, setup.mark
     try:
         record = run_episode(push, setup, CONTROLLERS["oracle"](kit), 60)
         assert record.reached("3d") and record.reached("2d") and record.limits[0] == 0.02 and record.part == "behind"

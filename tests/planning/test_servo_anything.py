@@ -13,6 +13,7 @@ from envs.errors import UsageError
 from planning.controllers.baselines import LinearController, ProportionalController
 from planning.controllers.pixel import PixelController
 from planning.controllers.t3vip import T3VIPController
+from planning.costs import Reach
 from planning.effectors import Tip
 from planning.followers import EffectorFollower, Surface, SurfaceFollower
 from planning.goals import Goal
@@ -150,14 +151,16 @@ def test_a_model_of_pictures_brings_it_to_the_pixel(block, far, make_pixel_model
 
 
 def test_what_is_not_touched_is_reached_for(far, make_exact_model):
-    """Nothing moves in what this model predicts: only the tip's distance to the point tells plans apart."""
+    """Nothing moves in what this model predicts: only where the tip can push from tells plans apart."""
+    way = (far.point_world - POINT)[:2]
+    behind = POINT[:2] - 0.08 * way / (np.linalg.norm(way) + 0.02)
     left = []
-    for reach in (0.0, 0.1):
+    for reach in (None, Reach(0.1, 0.08)):
         world = SlidingWorld(glued=False)
         model = taught(make_exact_model(world.camera, action_dim=3), world.camera)
         model.shift = lambda action: torch.zeros(len(action), 3)
         servo(T3VIPController(model, world.camera, planner(), reach=reach, **parts(world)), world, far, steps=18)
-        left.append(np.linalg.norm(world.tip - POINT[:2]))
+        left.append(np.linalg.norm(world.tip - behind))
     assert left[1] < 0.02 < left[0]
 
 
