@@ -47,6 +47,10 @@ class Clips:
         return Clips(*(getattr(self, field.name).to(device, non_blocking=True) for field in fields(self)))
 
 
+ROBOT_OBS = 15
+"""Numbers in CALVIN's `robot_obs`, of which the first three are where the TCP is."""
+
+
 @dataclass(frozen=True)
 class ClipTruth:
     """What the simulator knows about a batch of clips; flow at index t leads from frame t to frame t+1."""
@@ -57,8 +61,8 @@ class ClipTruth:
     """(B, T-1, H, W) bool, pixels of the end-effector in frame t."""
     bodies: Tensor
     """(B, T-1, H, W) int64, the body under each pixel of frame t; 0 is the world."""
-    tcp: Tensor
-    """(B, T, 3) metres, camera frame."""
+    tcp: Tensor | None
+    """(B, T, 3) metres, camera frame; None where proprioception is not that of an arm, `robot_obs` of CALVIN."""
 
 
 class ClipSource:
@@ -170,12 +174,13 @@ class ClipSource:
             ]
         )
         hand = np.isin(bodies[:, :-1], dataset.attrs["hand_body_ids"])
-        tcp = camera.to_camera(stored["proprio"][..., :3].astype(np.float64))
+        proprio = stored["proprio"].astype(np.float64)
+        tcp = camera.to_camera(proprio[..., :3]) if proprio.shape[-1] == ROBOT_OBS else None
         return ClipTruth(
             torch.from_numpy(flow).permute(0, 1, 4, 2, 3).float(),
             torch.from_numpy(hand),
             torch.from_numpy(bodies[:, :-1].astype(np.int64)),
-            torch.from_numpy(tcp).float(),
+            None if tcp is None else torch.from_numpy(tcp).float(),
         )
 
     def action_statistics(self, samples: int = 4096) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

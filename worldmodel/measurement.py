@@ -75,8 +75,9 @@ def measure_copy(data: ValidationSet, networks: Networks | None, tick: Tick) -> 
             truth = data.source.truth_at(starts, data.frames)
             moved = true_motion(data.source.dataset.camera, clips, truth, c)
             statistics |= motion_statistics(no_motion(moved), moved, truth.hand[:, c - 1 :])
-            way = (truth.tcp[:, -1] - truth.tcp[:, c - 1]).norm(dim=1)
-            statistics |= _tracking(way, way)
+            if truth.tcp is not None:
+                way = (truth.tcp[:, -1] - truth.tcp[:, c - 1]).norm(dim=1)
+                statistics |= _tracking(way, way)
         parts.append(statistics)
         tick(len(starts))
     return join(parts)
@@ -113,7 +114,8 @@ def measure_model(
             free = unroll(model, clips, c, still=kind == "still")
             statistics = _free(model, free, clips, c, networks)
             if isinstance(model, T3VIP) and truth is not None:
-                statistics |= _tracking(*track_tcp(model, clips, truth, free, c))
+                if truth.tcp is not None:
+                    statistics |= _tracking(*track_tcp(model, clips, truth.tcp, free, c))
                 statistics |= _taught(model, data, clips, truth, kind == "still")
             parts[kind].append(statistics)
         if inference is not None:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from worldmodel.clips import Clips, ClipSource, ClipTruth
+from worldmodel.clips import Clips, ClipSource
 from worldmodel.metrics import flow_scores, psnr_per_step, rmse_per_step
 from worldmodel.rollout import Rollout, unroll
 from worldmodel.t3vip import T3VIP, CloudPrediction
@@ -60,8 +60,8 @@ def validate(model: WorldModel, data: ValidationSet, still: bool = False) -> Sco
         Per predicted step after the context: `psnr`, `copy_psnr` (dB), and of T3VIP `depth_rmse`, `copy_depth_rmse`
         (metres) and `depth_psnr` (dB; its peak is the camera's working range, far less near). Means: `score` (RGB PSNR,
         of T3VIP plus depth PSNR, in dB: the paper's tuning metric); of T3VIP `inpainted` (share of pixels) and, with
-        ground truth, the terms of `flow_scores`, one step ahead of true frames, and `tracking_error`: how far the moved
-        TCP is off at the end of the clip, over how far it really went.
+        ground truth, the terms of `flow_scores`, one step ahead of true frames; of an arm `tracking_error`: how far
+        the moved TCP is off at the end of the clip, over how far it really went.
     """
     was_training = model.training
     model.eval()
@@ -85,7 +85,8 @@ def validate(model: WorldModel, data: ValidationSet, still: bool = False) -> Sco
             taught = unroll(model, clips, c, truth=1.0, still=still)
             flow = taught.stack("scene_flow")[:, c - 1 :].cpu()
             flows.append((flow, truth.scene_flow[:, c - 1 :], truth.hand[:, c - 1 :]))
-            tracked.append(track_tcp(model, clips, truth, free, c))
+            if truth.tcp is not None:
+                tracked.append(track_tcp(model, clips, truth.tcp, free, c))
     model.train(was_training)
     all_rgb = torch.cat(rgb)
     psnr = psnr_per_step(torch.cat(predicted_rgb), all_rgb[:, 1:])
@@ -109,24 +110,25 @@ def validate(model: WorldModel, data: ValidationSet, still: bool = False) -> Sco
     if flows:
         predicted, true, hand = (torch.cat(parts) for parts in zip(*flows, strict=True))
         scores.update(flow_scores(predicted, true, hand))
+    if tracked:
         error, way = (torch.cat(parts) for parts in zip(*tracked, strict=True))
         counts = way > MIN_WAY_M
         scores["tracking_error"] = float(error[counts].mean() / way[counts].mean())
     return scores
 
 
-def track_tcp(model: T3VIP, clips: Clips, truth: ClipTruth, free: Rollout, context: int) -> tuple[Tensor, Tensor]:
+def track_tcp(model: T3VIP, clips: Clips, tcp: Tensor, free: Rollout, context: int) -> tuple[Tensor, Tensor]:
     """How far the TCP, moved by predicted transforms, is off at the clip's end, and how far it went, (B,) metres."""
     points = clips.depth[:, context - 1] * model.rays
     ends = []
     for b in range(len(points)):
-        track = HandTrack.start(points[b], truth.tcp[b, context - 1].to(points), model.intrinsics, 1)
+        track = HandTrack.start(points[b], tcp[b, context - 1].to(points), model.intrinsics, 1)
         for prediction in free.predictions[context - 1 :]:
             assert isinstance(prediction, CloudPrediction)
             track = track.advance(prediction.transform[b : b + 1], prediction.masks[b : b + 1, :1])
         ends.append(track.tcp[0].cpu())
-    error = (torch.stack(ends) - truth.tcp[:, -1]).norm(dim=1)
-    return error, (truth.tcp[:, -1] - truth.tcp[:, context - 1]).norm(dim=1)
+    error = (torch.stack(ends) - tcp[:, -1]).norm(dim=1)
+    return error, (tcp[:, -1] - tcp[:, context - 1]).norm(dim=1)
 
 
 def summary(scores: Scores) -> str:
@@ -139,8 +141,10 @@ def summary(scores: Scores) -> str:
     if "flow_error_moving" in scores:
         line += (
             f", flow error {scores['flow_error_moving']:.2f} (hand {scores['flow_error_hand']:.2f}), false flow "
-            f"{1000 * float(scores['false_flow_m']):.2f} mm, tracking error {scores['tracking_error']:.2f}"  # type: ignore[arg-type]
+            f"{1000 * float(scores['false_flow_m']):.2f} mm"  # type: ignore[arg-type]
         )
+    if "tracking_error" in scores:
+        line += f", tracking error {scores['tracking_error']:.2f}"
     return line
 
 

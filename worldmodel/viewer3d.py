@@ -235,16 +235,17 @@ def _predicted_clouds(scene: Scene, shown: Shown) -> Iterator[tuple[int, _Cloud]
 @torch.inference_mode()
 def _tracks(scene: Scene) -> dict[str, NDArray[np.float64]]:
     """The TCP's way (P+1, 3) from the last frame seen on, world frame: the true one, and as each model moves it."""
-    if scene.truth is None:
+    if scene.truth is None or scene.truth.tcp is None:
         return {}
     now, camera = scene.context - 1, scene.camera
-    tracks = {TRUTH: camera.to_world(scene.truth.tcp[0, now:].numpy())}
+    tcp = scene.truth.tcp[0, now:]
+    tracks = {TRUTH: camera.to_world(tcp.numpy())}
     points = torch.from_numpy(camera.unproject(scene.clips.depth[0, now, 0].numpy())).permute(2, 0, 1).float()
     for shown in scene.models:
         if not isinstance(shown.model, T3VIP):
             continue
         device = shown.model.device
-        track = HandTrack.start(points.to(device), scene.truth.tcp[0, now].to(device), shown.model.intrinsics, 1)
+        track = HandTrack.start(points.to(device), tcp[0].to(device), shown.model.intrinsics, 1)
         way = [track.tcp[0].cpu().numpy()]
         for cloud in shown.clouds[now:]:
             track = track.advance(cloud.transform, cloud.masks[:, :1])

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torchmetrics.image import PeakSignalNoiseRatio
 
+from worldmodel import clips
 from worldmodel.colours import colour_wheel
 from worldmodel.metrics import flow_scores, psnr_per_step, rmse_per_step
 from worldmodel.pictures import picture_prediction
@@ -51,6 +52,13 @@ def test_flow_scores_of_known_flows():
     hand_only = torch.where(hand[:, :, None], true, torch.zeros_like(true))
     mixed = scores(hand_only)
     assert mixed["flow_error_hand"] == 0 and mixed["flow_error_moving"] == pytest.approx(0.5)
+
+
+def test_only_an_arm_has_a_tcp_to_track(make_model, validation, monkeypatch):
+    monkeypatch.setattr(clips, "ROBOT_OBS", 3)  # of some other robot than the one that the data is of
+    scores = validate(make_model(), validation)
+    assert "flow_error_moving" in scores and "tracking_error" not in scores
+    assert "false flow" in summary(scores) and "tracking" not in summary(scores)
 
 
 def test_without_transforms_the_scores_are_those_of_copying(make_model, validation):
