@@ -55,7 +55,7 @@ class Reach:
     beyond: float
     """metres behind the point"""
     near: float = 0.02
-    """metres from the goal at which the place is but half as far behind the point; at the goal it is the point itself"""
+    """metres from the goal at which it is but half as far behind; at the goal it is the point itself"""
 
     def cost(
         self, effector: ArrayOrTensor, point: ArrayOrTensor, goal: ArrayOrTensor, per_metre: float = 1.0

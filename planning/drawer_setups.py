@@ -1,4 +1,4 @@
-"""Setups of the drawer: the hand over the gap behind the handle, a point on the handle, how far open it shall be."""
+"""Setups of the drawer: the hand over the gap behind the handle, a point on the front, how far open it shall be."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ NEAREST, FARTHEST = 0.06, 0.15  # metres that the drawer is to slide
 ENDS = (0.005, DRAWER_TRAVEL - 0.02)  # metres open: where the goal may be
 BEHIND = np.array([0.0, 0.034, 0.0])  # metres from the handle to the middle of the gap between its bar and the drawer
 ABOVE, SIDEWAYS = (0.05, 0.09), 0.02  # metres: the hand's start over that place, and beside it at the most
-HANDLE = 0.06  # metres around the middle of the handle that are taken for it
+FRONT_LOW, FRONT_HIGH = np.array([0.05, -0.02, -0.05]), np.array([0.135, -0.005, 0.07])
+"""Metres, in the frame of the drawer: its front beside the handle, where the hand does not hide it from the camera."""
 CLOSED, CLOSING_STEPS = -1.0, 12  # gripper command; control steps until the fingers have closed
 SCENES = 100
 
@@ -29,7 +30,8 @@ def make_drawer_setup(env: gym.Env, index: int, seed: int = 0) -> PointSetup:
     """The setup of that index; the same for every model, every run and every number of setups.
 
     The table is that of a random episode. The hand is over the gap between the bar of the handle and the drawer's
-    front, fingers closed and pointing down: lowered into the gap it can pull the drawer and push it.
+    front, fingers closed and pointing down: lowered into the gap it can pull the drawer and push it. The point is on
+    the front beside the handle; the handle itself is hidden once the hand is lowered.
 
     Args:
         env: a tabletop environment that renders; its state is changed.
@@ -52,8 +54,7 @@ def make_drawer_setup(env: gym.Env, index: int, seed: int = 0) -> PointSetup:
         if room < NEAREST or not _place_hand(env, env_seed, offset):
             continue
         distance = NEAREST + share * (min(FARTHEST, room) - NEAREST)
-        handle = _handle(tabletop)
-        near = partial(_within, handle)
+        near = partial(_on_front, tabletop.mj_data.body("drawer").xpos)
         point = seen_on(env, "drawer", tabletop.observation()["depth"], rng, near)
         if point is None:
             continue
@@ -77,8 +78,9 @@ def _place_hand(env: gym.Env, env_seed: int, offset: NDArray) -> bool:
     return bool(np.linalg.norm(tabletop.tcp_position - place) < 0.005)
 
 
-def _within(handle: NDArray, points: NDArray) -> NDArray[np.bool_]:
-    return np.linalg.norm(points - handle, axis=-1) < HANDLE
+def _on_front(drawer: NDArray, points: NDArray) -> NDArray[np.bool_]:
+    """Which of points (H, W, 3) are on the front beside the handle of a drawer at a place (3,)."""
+    return np.all((points - drawer >= FRONT_LOW) & (points - drawer <= FRONT_HIGH), axis=-1)
 
 
 def _handle(tabletop: Any) -> NDArray[np.float64]:

@@ -26,6 +26,8 @@ class Surface:
     """metres around the point that the tracked piece of surface extends at the most"""
     step: float
     """metres of depth from pixel to pixel beyond which the surface ends"""
+    colour: float
+    """how far colours, in [0, 1], may be from that at the point before the surface ends; 1 for any"""
     radius: float
     """metres around the point within which pixels say how the body moves"""
 
@@ -87,7 +89,7 @@ class SurfaceFollower(Follower):
 
     def __init__(self, camera: CameraModel, surface: Surface) -> None:
         self.camera, self.surface = camera, surface
-        self.tracker = PointTracker(camera, surface.extent, surface.step)
+        self.tracker = PointTracker(camera, surface.extent, surface.step, surface.colour)
 
     def reset(self, observation: Observation, goal: Goal) -> None:
         if goal.designated is None:

@@ -24,8 +24,9 @@ Array = NDArray[np.float64]
 COLOUR_SCALE, DEPTH_SCALE = 0.06, 0.006  # differences, in [0, 1] and metres, beyond which a pixel counts as an outlier
 SURPRISE = np.array([0.015, 0.015, 0.15])  # m, m, rad: how far a motion may well be from that of the step before
 IN_FRONT = 0.015  # m; a point is hidden where what is seen is so much nearer, and says nothing then
-HIDDEN = 1.5  # disagreement of a hidden point: not nothing, lest the piece flee behind something
-POOR = 2.0  # mean disagreement of a point beyond which a fit may be a wrong one, and a wide search is made
+HIDDEN = 2.3  # disagreement of a hidden point: more than of one in sight, lest the piece flee behind things
+SLOWING = 0.7  # share of the last motion that is expected to come again
+POOR = 2.0  # mean disagreement of a point, squared, beyond which a fit may be wrong: a wide search is made
 AGREES = 0.012  # m; a point of the piece is in sight where the depth seen is not farther off
 MIN_POINTS = 4  # of the piece that must be in sight to say where it is seen
 
@@ -47,10 +48,11 @@ class PointTracker:
         camera: geometry of the camera that takes the frames.
         radius: metres around the point that the piece of surface extends at the most.
         step: metres of depth from pixel to pixel beyond which a surface ends.
+        colour: how far colours, in [0, 1], may be from that at the point before the surface ends; 1 for any.
     """
 
-    def __init__(self, camera: CameraModel, radius: float = 0.08, step: float = 0.01) -> None:
-        self.camera, self.radius, self.step = camera, radius, step
+    def __init__(self, camera: CameraModel, radius: float = 0.08, step: float = 0.01, colour: float = 1.0) -> None:
+        self.camera, self.radius, self.step, self.colour = camera, radius, step, colour
 
     def reset(self, rgb: NDArray, depth: NDArray, point: Array) -> None:
         """Begin with the first frame.
@@ -61,10 +63,14 @@ class PointTracker:
             point: (3,) metres, world frame, on a surface that the camera sees.
         """
         seen = self.camera.to_world(self.camera.unproject(depth))
-        piece = connected(depth, np.linalg.norm(seen - point, axis=-1), self.radius, self.step)
+        distance = np.linalg.norm(seen - point, axis=-1)
+        seed = np.unravel_index(np.argmin(distance), distance.shape)
+        alike = np.abs(rgb / 255 - rgb[seed] / 255).max(axis=-1) <= self.colour
+        piece = connected(depth, (int(seed[0]), int(seed[1])), alike & (distance <= self.radius), self.step)
         self._start = np.asarray(point, np.float64)
         self._offsets = seen[piece] - self._start  # (M, 3)
         self._colours = rgb[piece] / 255
+        self._depth_scales = DEPTH_SCALE + bend(depth)[piece] / 2  # at an edge the next picture may show what is beyond
         self._motion, self._last = np.zeros(3), np.zeros(3)
         self._depth = depth
 
@@ -83,7 +89,7 @@ class PointTracker:
             seen: (H, W, 4) colours in [0, 1] and depth of the new frame.
             tries: (N, 3) motions since the last frame to start from.
         """
-        expected = self._motion + self._last  # it goes on as it went
+        expected = self._motion + SLOWING * self._last
 
         def disagreement(motion: Array) -> Array:
             return self._disagreement(motion[None], seen, expected)[0]
@@ -124,14 +130,17 @@ class PointTracker:
 
     def _disagreement(self, motions: Array, seen: Array, expected: Array) -> Array:
         """What disagrees after each of some motions (N, 3): colours, depths, and how surprising it is: (N, 4 M + 3)."""
-        points = self.camera.to_camera(self._moved(motions))
-        there = read(seen, self.camera.project(points))
-        colours = (there[..., :3] - self._colours) / COLOUR_SCALE
-        depths = (there[..., 3] - points[..., 2]) / DEPTH_SCALE
-        hidden = there[..., 3] < points[..., 2] - IN_FRONT
+        colours, depths, hidden = self._differences(motions, seen)
         colours, depths = np.where(hidden[..., None], 0.0, colours), np.where(hidden, HIDDEN, depths)
         surprise = (motions - expected) / SURPRISE * np.sqrt(len(self._offsets)) / 2
-        return np.concatenate([colours.reshape(len(motions), -1) / np.sqrt(3), depths, surprise], axis=1)
+        return np.concatenate([colours.reshape(len(motions), -1), depths, surprise], axis=1)
+
+    def _differences(self, motions: Array, seen: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """What differs after motions (N, 3): colours (N, M, 3) and depths (N, M), scaled; which points are hidden."""
+        points = self.camera.to_camera(self._moved(motions))
+        there = read(seen, self.camera.project(points))
+        colours = (there[..., :3] - self._colours) / (COLOUR_SCALE * np.sqrt(3))
+        return colours, (there[..., 3] - points[..., 2]) / self._depth_scales, there[..., 3] < points[..., 2] - IN_FRONT
 
 
 def soft(residuals: Array) -> Array:
@@ -150,19 +159,27 @@ def read(picture: Array, pixels: Array) -> Array:
     return upper * (1 - down) + lower * down
 
 
-def connected(depth: NDArray, distance: NDArray, radius: float, step: float) -> NDArray[np.bool_]:
+def bend(depth: NDArray) -> Array:
+    """How far a depth image (H, W) is from a plane at each pixel: twice what the neighbours' mean is off, metres."""
+    wide = np.pad(depth.astype(np.float64), 1, mode="edge")
+    inner = 2 * wide[1:-1, 1:-1]
+    return np.maximum(
+        np.abs(wide[1:-1, :-2] + wide[1:-1, 2:] - inner), np.abs(wide[:-2, 1:-1] + wide[2:, 1:-1] - inner)
+    )
+
+
+def connected(depth: NDArray, seed: tuple[int, int], usable: NDArray[np.bool_], step: float) -> NDArray[np.bool_]:
     """The pixels of one surface.
 
     Args:
         depth: (H, W) metres.
-        distance: (H, W) metres from the point to what each pixel sees; the surface is that of the least.
-        radius: where the surface is cut off, metres.
+        seed: row and column of a pixel on it.
+        usable: (H, W) bool, what may belong to it.
         step: depth from a pixel to its neighbour beyond which they are of two surfaces, metres.
 
     Returns:
-        (H, W) bool; at least one pixel.
+        (H, W) bool; the seed at least.
     """
-    seed = tuple(int(i) for i in np.unravel_index(np.argmin(distance), distance.shape))
     inside = np.zeros(depth.shape, bool)
     inside[seed] = True
     todo = [seed]
@@ -171,7 +188,7 @@ def connected(depth: NDArray, distance: NDArray, radius: float, step: float) -> 
         for at in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
             if not (0 <= at[0] < depth.shape[0] and 0 <= at[1] < depth.shape[1]) or inside[at]:
                 continue
-            if distance[at] <= radius and abs(depth[at] - depth[row, column]) <= step:
+            if usable[at] and abs(depth[at] - depth[row, column]) <= step:
                 inside[at] = True
                 todo.append(at)
     return inside

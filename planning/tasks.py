@@ -65,12 +65,12 @@ TASKS: dict[tuple[str, str], Task] = {
     ),
     ("tabletop", "drawer"): Task(
         "t3vip/Tabletop{scene}-v0", ("D", "A", "B", "C"), make_drawer_setup, "drawer of scene {scene}",
-        surface=Surface(extent=0.08, step=0.03, radius=0.05), reach=Reach(0.3, 0.034), planner=ICEMConfig(horizon=5),
+        surface=Surface(extent=0.1, step=0.03, colour=0.08, radius=0.05), planner=ICEMConfig(horizon=5),
     ),
     ("planar-push", "object"): Task(
         "t3vip/PlanarPush-v0", ("test", "validation", "train", "all"), make_push_setup, "push {scene} objects",
-        scene_keyword="split", body=Tip, surface=Surface(extent=0.08, step=0.01, radius=0.025), reach=Reach(0.15, 0.1),
-        planner=ICEMConfig(horizon=6), zoom=1.5,
+        scene_keyword="split", body=Tip, surface=Surface(extent=0.08, step=0.01, colour=1.0, radius=0.025),
+        reach=Reach(0.15, 0.1), planner=ICEMConfig(horizon=6), zoom=1.5,
     ),
 }  # fmt: skip
 """Environment and point -> the task; the first point of an environment is the usual one."""

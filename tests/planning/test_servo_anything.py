@@ -21,7 +21,7 @@ from planning.icem import ICEM, ICEMConfig
 from planning.point_tracker import PointTracker
 
 HEIGHT, HALF = 0.04, 0.06  # m, of a square block on the table
-SURFACE = Surface(extent=0.08, step=0.01, radius=0.03)
+SURFACE = Surface(extent=0.08, step=0.01, colour=1.0, radius=0.03)
 POINT = np.array([0.02, 0.03, HEIGHT])  # on the block, which starts in the middle
 
 
