@@ -60,7 +60,10 @@ def connect(address: str | None, cpus: int | None) -> Iterator[None]:
                 continue
             where = "Ray does not start here" if address is None else f"cannot join the Ray cluster at '{address}'"
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise UsageError(f"{where} ({reason}); see what ray start --head says, or leave out --ray") from error
+            remedy = "see what ray start --head says, or leave out --ray"
+            if address is not None and os.environ.get("RAY_AUTH_MODE") is None:
+                remedy += "; if it wants a token, which Ray sends nowhere unasked, set RAY_AUTH_MODE=token"
+            raise UsageError(f"{where} ({reason}); {remedy}") from error
     if callable(on_sigterm) and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, on_sigterm)  # a cluster of our own has put its handler in that place
     try:

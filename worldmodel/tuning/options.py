@@ -111,13 +111,14 @@ class TuneOptions:
         Raises:
             UsageError: there are too few.
         """
-        first = -(-steps // self.reduction**self.rungs)
-        rungs = tuple(first * self.reduction**k for k in range(self.rungs))
-        if rungs and rungs[-1] >= steps:
+        smallest = self.reduction**self.rungs
+        if steps < smallest:
             raise UsageError(
                 f"steps is {steps}, too few for {self.rungs} rungs, each {self.reduction} times the one before; give "
-                f"at least {self.reduction**self.rungs}, or fewer --rungs"
+                f"at least {smallest}, or fewer --rungs"
             )
+        first = -(-steps // smallest)
+        rungs = tuple(first * self.reduction**k for k in range(self.rungs))
         return (*rungs, steps)
 
     @property

@@ -111,7 +111,9 @@ def markdown(document: Document) -> str:
     if document["best"] is not None:
         best = trials[document["best"]]
         line = f"Best of those that ran to the end: trial {best['number']}, {best['scores'][str(budgets[-1])]:.2f} dB"
-        if document["gain"] is not None:
+        if best["number"] == 0:
+            line += ", the preset's own values"
+        elif document["gain"] is not None:
             line += f", {document['gain']:+.2f} dB against trial 0, which has the preset's values"
         lines += [f"{line}.", ""]
     lines += _table(

@@ -87,7 +87,9 @@ class Numbered(Searcher):
         if self._count == 0:
             self._first_id = trial_id
         self._count += 1
-        plain = {name: int(value) if name == POWER else float(value) for name, value in point.items()}  # no numpy in JSON
+        plain = {
+            name: int(value) if name == POWER else float(value) for name, value in point.items()
+        }  # no numpy in JSON
         return {**plain, "number": self._count - 1}
 
     def on_trial_result(self, trial_id: str, result: dict[str, Any]) -> None:

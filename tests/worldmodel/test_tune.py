@@ -1,0 +1,108 @@
+"""`tune-worldmodel` on a Ray cluster of this machine: processes are killed, and the same command goes on."""
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import psutil
+import pytest
+
+from envs.command import run
+from worldmodel import train
+from worldmodel.options import TrainOptions
+from worldmodel.tuning import journal
+
+TRIALS, STEPS = 4, 12
+LINE = ["--preset", "tiny", "--trials", TRIALS, "--steps", STEPS, "--rungs", 1, "--unpruned", 2, "--workers", 1]
+
+
+@pytest.fixture
+def start(tiny_dataset, tmp_path):
+    """Starts the command in a process of its own."""
+    begun = []
+
+    def begin():
+        line = [sys.executable, "-m", "worldmodel.tune", "--data", tiny_dataset, "--out", tmp_path / "tuned", *LINE]
+        with (tmp_path / "log.txt").open("ab") as log:
+            environment = os.environ | {"TORCHDYNAMO_DISABLE": "1"}
+            begun.append(subprocess.Popen(list(map(str, line)), stdout=log, stderr=log, env=environment))
+        return begun[-1]
+
+    yield begin
+    for process in begun:
+        process.kill()
+        process.wait()
+
+
+def wait_for(process, found):
+    while not (value := found()):
+        assert process.poll() is None, "it ended before"
+        time.sleep(0.05)
+    return value
+
+
+def validated(out):
+    path = out / "trials/000/metrics.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+@pytest.mark.timeout(900)
+def test_a_worker_and_then_the_search_are_killed_and_the_same_command_goes_on(start, tiny_dataset, tmp_path, capsys):
+    out = tmp_path / "tuned"
+    results = out / journal.JOURNAL
+
+    def lines(kind):
+        return [line for line in journal.read(results) if line["kind"] == kind]
+
+    process = start()
+    first = wait_for(process, lambda: lines("score"))[0]
+    assert first["trial"] == 0 and first["step"] == STEPS // 3
+    os.kill(first["pid"], signal.SIGKILL)
+    assert wait_for(process, lambda: lines("death"))[0]["trial"] == 0
+    dead = first["pid"]
+    wait_for(process, lambda: [line for line in lines("score") if line["pid"] != dead])
+    everyone = psutil.Process(process.pid).children(recursive=True)
+    process.kill()
+    process.wait()
+    assert not psutil.wait_procs(everyone, timeout=60)[1]  # Ray's processes go with it
+
+    process = start()
+    assert process.wait() == 0, (tmp_path / "log.txt").read_text()[-3000:]
+    trials = journal.trials(results)
+    assert [trial.number for trial in trials] == list(range(TRIALS))
+    assert {trial.status for trial in trials} <= {"finished", "stopped"}
+    for trial in trials[:2]:  # the unpruned ones
+        assert trial.status == "finished" and set(trial.scores) == {4, 8, 12}
+    assert trials[0].deaths == 1
+
+    steps = [line["step"] for line in validated(out) if line["kind"] == "train"]
+    assert set(steps) == set(range(1, STEPS + 1))
+    again = [then for now, then in itertools.pairwise(steps) if then <= now]
+    assert again and min(again) > STEPS // 3  # it went on behind its first score, not from the beginning
+
+    report = json.loads((out / "report.json").read_text())
+    best = max((trial for trial in trials if trial.status == "finished"), key=lambda trial: trial.score)
+    assert report["best"] == best.number and (out / "trials.png").exists()
+    line = [
+        "--config",
+        out / "best.json",
+        "--data",
+        tiny_dataset,
+        "--out",
+        tmp_path / "run",
+        "--steps",
+        1,
+        "--batch",
+        1,
+    ]
+    run(TrainOptions, train.main, list(map(str, line)), train._preset)
+    trained = json.loads((tmp_path / "run/config.json").read_text())
+    assert trained["preset"] == "tiny" and trained["learning_rate"] == best.point["learning_rate"]
+    assert trained["losses"]["knn"] == best.point["knn"] and trained["losses"]["power"] == best.point["power"]
+
+    before = results.read_bytes()
+    assert start().wait() == 0 and results.read_bytes() == before  # there is nothing left to do
