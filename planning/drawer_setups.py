@@ -68,7 +68,7 @@ def make_drawer_setup(env: gym.Env, index: int, seed: int = 0) -> PointSetup:
 def _place_hand(env: gym.Env, env_seed: int, offset: NDArray) -> bool:
     """Begin the episode anew, the hand at an offset (3,) from the gap, and close its fingers; False if it cannot be."""
     tabletop: Any = env.unwrapped
-    place = _handle(tabletop) + BEHIND + offset
+    place = gap(tabletop) + offset
     try:
         env.reset(seed=env_seed, options={"tcp": place})  # the same table
     except UsageError:  # out of reach, or in something
@@ -83,6 +83,6 @@ def _on_front(drawer: NDArray, points: NDArray) -> NDArray[np.bool_]:
     return np.all((points - drawer >= FRONT_LOW) & (points - drawer <= FRONT_HIGH), axis=-1)
 
 
-def _handle(tabletop: Any) -> NDArray[np.float64]:
-    """The middle of the bar (3,), metres."""
-    return tabletop.mj_data.site("drawer_handle").xpos.copy()
+def gap(tabletop: Any) -> NDArray[np.float64]:
+    """The middle of the gap behind the handle's bar (3,), metres, world frame."""
+    return tabletop.mj_data.site("drawer_handle").xpos + BEHIND

@@ -38,6 +38,9 @@ class Effector:
     def reset(self, observation: Observation) -> None:
         """Start an episode with its first observation."""
 
+    def aim(self, way: Array) -> None:
+        """Be told, before every decision, which way (3,) the designated point has to go, metres, world frame."""
+
     def position(self, observation: Observation) -> Array:
         """Measured position (3,) in the world, metres."""
         raise NotImplementedError
@@ -70,7 +73,11 @@ class Arm(Effector):
 
 
 class Tip(Effector):
-    """The tip of the planar pusher; the heading of a push is the direction of the move.
+    """The tip of the planar pusher; the heading is the direction in which the object shall go.
+
+    In the data it is the direction of the coming push, all the way round the object too. Models take a tip that moves
+    along the heading for one that pushes, also where nothing is in its way: with each move's own direction as heading
+    they foresee pushes everywhere.
 
     Its limit is half of what the environment allows. Pushes in the data are slower still, and the kernels of the
     models of pictures reach about as far as the tip then goes in a frame gap of 3.
@@ -80,13 +87,18 @@ class Tip(Effector):
     low = np.append(push_control.WORKSPACE_LOW, TIP_HEIGHT)
     high = np.append(push_control.WORKSPACE_HIGH, TIP_HEIGHT)
 
+    heading = 0.0  # rad
+
+    def aim(self, way: Array) -> None:
+        self.heading = float(np.arctan2(way[1], way[0]))
+
     def position(self, observation: Observation) -> Array:
         return np.append(np.asarray(observation["proprio"][:2], np.float64), TIP_HEIGHT)
 
     def action(self, move: NDArray) -> NDArray[np.float32]:
         move = np.asarray(move, np.float32)
-        heading = np.arctan2(move[..., 1], move[..., 0]) * np.float32(1 / push_control.ACTION_SCALE[2])
-        return np.concatenate([move, heading[..., None]], axis=-1)
+        heading = np.full((*move.shape[:-1], 1), self.heading / push_control.ACTION_SCALE[2], np.float32)
+        return np.concatenate([move, heading], axis=-1)
 
 
 def held_gripper(observation: Observation) -> float:

@@ -63,6 +63,7 @@ class HoldingController:
         start = time.perf_counter()
         self.follower.observe(observation)
         if self._steps % self.hold == 0:
+            self.effector.aim(self.goal.point_world - self.follower.point)
             self.action = self.effector.action(self.decide(observation))
             self.plan_seconds.append(time.perf_counter() - start)
         self._steps += 1

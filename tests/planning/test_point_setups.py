@@ -9,7 +9,7 @@ import pytest
 
 from planning import servo_eval
 from planning.controllers import CONTROLLERS, Kit
-from planning.drawer_setups import BEHIND, make_drawer_setup
+from planning.drawer_setups import gap, make_drawer_setup
 from planning.episode import run_episode
 from planning.icem import ICEMConfig
 from planning.push_setups import FARTHEST, NEAREST, make_push_setup
@@ -59,11 +59,11 @@ def test_drawer_setups_are_what_they_promise(table):
         np.testing.assert_allclose(setup.mark.position(table), setup.goal.designated, atol=1e-9)
         way = setup.goal.point_world - setup.goal.designated
         assert np.abs(way[[0, 2]]).max() < 1e-9 and (setup.part == "open") == (way[1] < 0)
-        gap = table.unwrapped.mj_data.site("drawer_handle").xpos + BEHIND
-        assert np.abs((table.unwrapped.tcp_position - gap)[:2]).max() < 0.03 and observation["proprio"][14] == -1
+        middle = gap(table.unwrapped)
+        assert np.abs((table.unwrapped.tcp_position - middle)[:2]).max() < 0.03 and observation["proprio"][14] == -1
 
         # Lowered into the gap the hand moves the drawer, and the mark goes with it, as the simulator says beforehand.
-        lower = int(np.ceil((table.unwrapped.tcp_position - gap)[2] / 0.02))
+        lower = int(np.ceil((table.unwrapped.tcp_position - middle)[2] / 0.02))
         moves = np.zeros((lower + 5, 7), np.float32)
         moves[:lower, 2], moves[lower:, 1], moves[:, 6] = -1, np.sign(way[1]), -1
         simulator = what_if(table)
@@ -93,7 +93,7 @@ def test_the_oracle_pushes_a_point_to_its_goal_as_its_simulator_says(push):
         kit.close()
     for action in actions[0]:
         push.step(action)
-    np.testing.assert_allclose(paths.point[0, -1], setup.mark.position(push), atol=1e-4)
+    np.testing.assert_allclose(paths.point[0, -1], setup.mark.position(push), atol=5e-4)  # it may tilt
     np.testing.assert_allclose(paths.effector[0, -1], push.unwrapped.tcp_position, atol=1e-6)
     assert not run_episode(push, setup, CONTROLLERS["random"](kit), 20).reached("3d")
 
