@@ -95,6 +95,17 @@ def table(report: dict[str, Any]) -> str:
     if "moved" in report:
         lines += ["", "share of episodes in which it moved"]
         lines += [f"  {name:<12}{share:>5.0%}" for name, share in report["moved"].items()]
+    if "goals" in report:
+        goals = report["goals"]
+        steps = goals["median_steps_to_reach"]
+        lines += [
+            "",
+            f"goals         {goals['given']}, {goals['reached']:.0%} reached"
+            + (f" after {steps:g} steps (median)" if steps is not None else "")
+            + f"; rotation error {goals['median_degrees_at_start']:.0f} degrees where they are given, "
+            f"{goals['median_degrees_at_end']:.0f} where they end (medians); "
+            f"{goals['episodes_dropped']:.0%} of episodes drop the cube",
+        ]
     return "\n".join(lines)
 
 

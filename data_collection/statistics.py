@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_collection.dataset import RGBDDataset
+from data_collection.goal_statistics import goal_statistics
 
 VOXEL = 0.05  # metres: edge of the cells in which workspace coverage is counted
 
@@ -49,6 +50,8 @@ def describe(dataset: RGBDDataset) -> dict[str, Any]:
         report["workspace"] = workspace_coverage(proprio[:, :3], np.asarray(dataset.attrs["workspace"]))
     if "scene_obs" in dataset.columns and "Tabletop" in str(dataset.attrs["env_id"]):
         report["moved"] = moved_shares(dataset.load("scene_obs"), dataset.episode_slices)
+    if "scene_obs" in dataset.columns and "DexHand" in str(dataset.attrs["env_id"]):
+        report["goals"] = goal_statistics(dataset.load("scene_obs"), dataset.episode_slices)
     return report
 
 

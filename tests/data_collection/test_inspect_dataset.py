@@ -11,10 +11,12 @@ from shards import ATTRS, flip_a_byte_of, make_episode
 
 from data_collection.dataset import RGBDDataset
 from data_collection.files import locked
+from data_collection.goal_statistics import goal_statistics
 from data_collection.repair import find_damage, repair
 from data_collection.schema import episode_hash
 from data_collection.statistics import moved_shares, workspace_coverage
 from data_collection.writer import write_shard
+from envs.dexhand.goals import HOME
 from envs.errors import UsageError
 
 
@@ -117,3 +119,23 @@ def test_workspace_coverage_of_known_positions():
     assert full["share_of_frames_inside"] == 1
     half = workspace_coverage(np.concatenate([centres[:250], centres[:250] + 9]), workspace)
     assert half["share_of_cells_visited"] == 0.25 and half["share_of_frames_inside"] == 0.5
+
+
+def test_goals_of_a_hand_are_counted_where_they_change():
+    def pose(degrees):
+        half = np.radians(degrees) / 2
+        return [*HOME, np.cos(half), 0, 0, np.sin(half)]
+
+    rows = [(0, 60), (40, 60), (55, 60), (55, 100), (70, 100)]  # cube and goal, degrees: one reached, one not
+    rows += [(0, 30), (10, 30)]  # the next episode
+    scene_obs = np.array([pose(cube) + pose(goal) for cube, goal in rows], np.float32)
+    scene_obs[-1, 2] = 0.05  # dropped
+    found = goal_statistics(scene_obs, np.array([[0, 5], [5, 7]]))
+    assert found == {
+        "given": 3,
+        "reached": 0.3333,
+        "median_steps_to_reach": 2.0,
+        "median_degrees_at_start": 45.0,
+        "median_degrees_at_end": 20.0,
+        "episodes_dropped": 0.5,
+    }

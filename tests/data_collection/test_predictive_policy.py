@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 from commands import call
 
-from data_collection import goal_scores, train_policy
+from data_collection import goal_scores, hand_pictures, train_policy
 from data_collection.dataset import RGBDDataset
 from data_collection.environments import resolve_env, usual_policy
 from data_collection.policies import make_policy
@@ -190,6 +191,12 @@ def test_a_trained_policy_acts_in_the_collector(trained, tmp_path):
         env.set_state(state)
         np.testing.assert_allclose(model.predict(env.observation(), deterministic=True)[0], action, atol=1e-5)
     env.close()
+    hand_pictures.main(hand_pictures.Config(out, tmp_path, moments=3, size=20))
+    picture = imageio.imread(tmp_path / "dexhand.png")
+    assert picture.shape[:2] == (60, 60)
+    assert not np.array_equal(picture[:, :20], picture[:, 40:])
+    with pytest.raises(UsageError, match="episodes 0 to 0"):
+        hand_pictures.main(hand_pictures.Config(out, tmp_path, episode=1))
 
 
 def test_training_goes_on_where_it_stopped(trained, tmp_path):
