@@ -18,9 +18,9 @@ def main(options: TuneOptions) -> None:
     options.budgets  # noqa: B018  refuse options before anything is written
     options.out.mkdir(parents=True, exist_ok=True)
     with locked(options.out):
-        data = settle(options)
+        data = [settle(options)]
         if unfinished(options):
-            search(options, data)
+            search(options, data.pop())  # to hand it over, not to keep a second copy
         stopped = unfinished(options)
         write_report(options.out)
     print((options.out / "report.md").read_text())

@@ -62,7 +62,8 @@ class TuneOptions:
     retries: int = 3
     """How often a trial whose process dies is started again from its own last checkpoint."""
     ray: str | None = None
-    """HOST:PORT of a running Ray cluster, or auto; by default trials run on this machine."""
+    """HOST:PORT of a running Ray cluster, auto for the one of this machine, or local, as by default, for one that is
+    started here and ends with the command."""
 
     def __post_init__(self) -> None:
         for name, least in (("trials", 1), ("unpruned", 1), ("reduction", 2), ("rungs", 0), ("cpus_per_trial", 1),

@@ -86,9 +86,10 @@ def search(options: TuneOptions, data: Data) -> None:
     for name, value in QUIET.items():
         os.environ.setdefault(name, value)
     workers = options.workers or max(len(os.sched_getaffinity(0)) // options.cpus_per_trial, 1)
-    with connect(options.ray, workers * options.cpus_per_trial):
+    with connect(None if options.ray == "local" else options.ray, workers * options.cpus_per_trial):
         _check_room(options)
         tuner = _tuner(options, data)
+        del data  # Ray holds it now, for all processes
         tuner.fit()
 
 
@@ -122,7 +123,7 @@ def _tuner(options: TuneOptions, data: Data) -> Any:
             num_samples=options.trials,
             search_alg=make_searcher(options.searcher, axes, point_of(training, axes), options.budgets, options.seed),
             scheduler=Halving(results, options.budgets, options.reduction, options.unpruned),
-            max_concurrent_trials=options.workers if options.ray else None,
+            max_concurrent_trials=options.workers if options.ray not in (None, "local") else None,
             reuse_actors=True,
             trial_dirname_creator=_trial_name,
         ),

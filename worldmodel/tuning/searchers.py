@@ -17,6 +17,10 @@ from worldmodel.tuning.space import POWER, POWERS, Axis, Point, draw
 
 NEEDS: dict[str, tuple[str, ...]] = {"random": (), "bohb": ("hpbandster", "ConfigSpace"), "hebo": ("hebo",)}
 """Packages by the names under which they are imported."""
+INSTALL = {
+    "bohb": "pip install --constraint constraints.txt --editable '.[bohb]'",
+    "hebo": "pip install HEBO where numpy is as old as it wants (below 1.25, says 0.3.6)",
+}
 SETTINGS = {"metric": "score", "mode": "max"}
 
 
@@ -30,9 +34,9 @@ def check_searcher(name: SearcherName) -> None:
         try:
             importlib.import_module(package)
         except Exception as error:  # packages as old as these fail in many ways
+            reason = (str(error) or type(error).__name__).splitlines()[0]
             raise UsageError(
-                f"searcher {name} needs {package}, which is not to be had here ({type(error).__name__}: "
-                f"{str(error).splitlines()[0] if str(error) else ''}); pip install 't3vip[{name}]', or give "
+                f"searcher {name} needs {package}, which cannot be imported here ({reason}); {INSTALL[name]}, or give "
                 "--searcher random"
             ) from error
 

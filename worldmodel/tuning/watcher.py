@@ -114,9 +114,9 @@ def _number(trial: Any) -> int:
 
 
 def _reason(trial: Any) -> str:
-    """The last line of what Ray says about an error: the kind of exception and its message."""
+    """What Ray says last about an error: the kind of exception and its message, or how the process died."""
     path = trial.error_file
     lines = (
         [line for line in Path(path).read_text().splitlines() if line.strip()] if path and Path(path).exists() else []
     )
-    return lines[-1].strip()[:200] if lines else "unknown"
+    return lines[-1].strip().split(". ")[0][:200] if lines else "unknown"

@@ -1,0 +1,94 @@
+"""One trial, without Ray: what it reports, where it goes on, and that numbers that are none do not end a search."""
+
+import contextlib
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from worldmodel import trainer as training
+from worldmodel.training_data import open_data
+from worldmodel.tuning import trial as trials
+from worldmodel.tuning.options import TuneOptions
+from worldmodel.tuning.space import axes_of, point_of
+
+STEPS = 6
+
+
+@pytest.fixture
+def begin(tiny_dataset, tmp_path, monkeypatch):
+    """Runs trial 0 of a search with a rung after 3 steps; gives what it reported until it ended or was killed."""
+    options = TuneOptions(tiny_dataset, tmp_path, preset="tiny", steps=STEPS, reduction=2, rungs=1)
+    training_options = options.training
+    data = open_data(training_options)
+    for column in data[0]._columns.values():
+        column.flags.writeable = False  # as Ray's shared memory is
+    threads = torch.get_num_threads()
+
+    def call(kill_at=math.inf, **changes):
+        told = []
+
+        def report(result):
+            told.append(result)
+            if result["step"] >= kill_at:
+                raise SystemExit
+
+        monkeypatch.setattr(trials.tune, "report", report)
+        point = point_of(training_options, axes_of(training_options)) | changes
+        with contextlib.suppress(SystemExit):
+            trials.run_trial({**point, "number": 0}, training_options, data, threads)
+        return told
+
+    call.out = Path(training_options.out) / "000"
+    return call
+
+
+def steps_of(told):
+    return [result["step"] for result in told]
+
+
+def trained(out):
+    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    return [line["step"] for line in lines if line["kind"] == "train"]
+
+
+def test_a_trial_that_is_killed_goes_on_and_tells_everything_again(begin):
+    killed = begin(kill_at=3)
+    assert steps_of(killed) == [3] and not killed[0]["diverged"]
+    assert killed[0]["score"] == pytest.approx(killed[0]["psnr"] + killed[0]["depth_psnr"])
+    assert (begin.out / "checkpoints" / "step-00000003").exists()  # before the score was told
+    told = begin()
+    assert steps_of(told) == [3, STEPS] and told[0]["score"] == killed[0]["score"]
+    assert trained(begin.out) == list(range(1, STEPS + 1))  # no step twice
+    again = begin()
+    assert [(r["step"], r["score"]) for r in again] == [(r["step"], r["score"]) for r in told]
+    assert trained(begin.out) == list(range(1, STEPS + 1))
+
+
+def test_another_configuration_in_the_folder_is_begun_anew(begin):
+    begin(kill_at=3)
+    other = begin(rgb=0.1)
+    assert steps_of(other) == [3, STEPS] and trained(begin.out) == list(range(1, STEPS + 1))
+    assert json.loads((begin.out / "config.json").read_text())["losses"]["rgb"] == 0.1
+
+
+def test_a_loss_that_is_no_number_makes_a_bad_trial(begin, monkeypatch):
+    objective = training.Trainer.objective
+
+    def spoiled(self, clips):
+        total, terms = objective(self, clips)
+        return total * math.nan, {name: math.nan for name in terms}
+
+    monkeypatch.setattr(training, "MAX_BAD_STEPS", 2)
+    monkeypatch.setattr(training.Trainer, "objective", spoiled)
+    (told,) = begin()
+    assert told["diverged"] and told["score"] == trials.WORST_DB and "not finite" in told["reason"]
+
+
+def test_so_does_a_score_that_is_none(begin, monkeypatch):
+    validate = training.validate
+    monkeypatch.setattr(training, "validate", lambda *arguments: validate(*arguments) | {"score": math.nan})
+    (told,) = begin()
+    assert told["diverged"] and told["step"] == 3 and "score" in told["reason"]
