@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import time
 from pathlib import Path
 from unittest import mock
@@ -39,20 +40,24 @@ def cluster(tmp_path_factory):
     nodes.shutdown()
 
 
-def started_nodes(tries=3):
-    """Ray gives a node 30 s to start, which a busy machine may exceed."""
+def started_nodes():
     from ray.cluster_utils import Cluster
 
-    for attempt in range(tries):
-        nodes = Cluster()
-        try:
-            nodes.add_node(num_cpus=1, include_dashboard=False)
-            nodes.add_node(num_cpus=1)
-            return nodes
-        except Exception:
-            nodes.shutdown()
-            if attempt == tries - 1:
-                raise
+    nodes = Cluster()
+    nodes.add_node(num_cpus=1, include_dashboard=False, **agents())
+    nodes.add_node(num_cpus=1, **agents())
+    return nodes
+
+
+def agents():
+    """Ports of a node's helpers. Where they choose some themselves, Ray waits for them no longer than 30 s, which is
+    too short for a busy machine."""
+    names = ("metrics_agent_port", "metrics_export_port", "dashboard_agent_listen_port", "runtime_env_agent_port")
+    sockets = [socket.create_server(("", 0)) for _ in names]
+    ports = {name: taken.getsockname()[1] for name, taken in zip(names, sockets, strict=True)}
+    for taken in sockets:
+        taken.close()
+    return ports
 
 
 def shards(folder):
