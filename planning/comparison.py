@@ -130,8 +130,8 @@ def _draw_bars(
     for i, (name, entries) in enumerate(groups.items()):
         shares, errors = _bounds(entries, spaces)
         places = np.arange(len(entries)) + (i - (len(groups) - 1) / 2) * width
-        look = {"color": COLOURS.get(name, "#444444"), "label": name}
-        axes.bar(places, shares, 0.9 * width, yerr=errors, capsize=2.5, error_kw={"lw": 1}, **look)
+        colour = COLOURS.get(name, "#444444")
+        axes.bar(places, shares, 0.9 * width, yerr=errors, capsize=2.5, error_kw={"lw": 1}, color=colour, label=name)
     axes.set_xticks(range(len(labels)), labels, fontsize=9)
 
 
@@ -141,8 +141,8 @@ def _draw_by_share(axes: Axes, models: Mapping[str, Mapping[str, Any]], space: s
         bins = entry["by_axis_bin"]
         shares, errors = _bounds(bins, [space] * len(bins))
         places = np.arange(len(bins)) + (i - (len(models) - 1) / 2) * 0.6 / len(models)
-        look = {"color": COLOURS.get(name, "#444444"), "label": name}
-        axes.errorbar(places, shares, errors, fmt="o-", ms=4, lw=1.2, elinewidth=1, capsize=2, **look)
+        look = {"fmt": "o-", "ms": 4, "lw": 1.2, "elinewidth": 1, "capsize": 2, "color": COLOURS.get(name, "#444444")}
+        axes.errorbar(places, shares, errors, label=name, **look)  # type: ignore[arg-type]
     counts = [part["episodes"] for part in next(iter(models.values()))["by_axis_bin"]]
     ticks = [f"{low:g}-{high:g}\nn={n}" for low, high, n in zip(AXIS_BINS[:-1], AXIS_BINS[1:], counts, strict=True)]
     axes.set_xticks(range(len(ticks)), ticks, fontsize=8)

@@ -13,7 +13,7 @@ from envs.errors import UsageError
 from planning.effectors import Effector, Observation
 from planning.goals import Goal
 from planning.point_tracker import PointTracker
-from worldmodel.tracking import HAND_RADIUS, hand_pixels
+from worldmodel.tracking import HAND_RADIUS, LEAST_FOREGROUND, hand_pixels
 
 Array = NDArray[np.float64]
 
@@ -37,9 +37,11 @@ class Follower:
 
     Attributes:
         point: (3,) metres, world frame, where the point is now.
+        least_foreground: `least` of `worldmodel.tracking.HandTrack` for this body.
     """
 
     point: Array
+    least_foreground: float
 
     def reset(self, observation: Observation, goal: Goal) -> None:
         """Start an episode with its first observation."""
@@ -57,10 +59,14 @@ class Follower:
 class EffectorFollower(Follower):
     """The point is the end-effector's own: proprioception says where it is.
 
+    What moves among the pixels near it is the end-effector, so its motion is set apart from what stands still there.
+
     Args:
         effector: whose.
         radius: metres around the point that are taken for the end-effector.
     """
+
+    least_foreground = LEAST_FOREGROUND
 
     def __init__(self, effector: Effector, radius: float = HAND_RADIUS) -> None:
         self.effector, self.radius = effector, radius
@@ -82,10 +88,15 @@ class EffectorFollower(Follower):
 class SurfaceFollower(Follower):
     """The point lies on a thing and is followed by its looks.
 
+    A thing may stand still while the end-effector moves beside it: what little of that is blended into the thing's
+    pixels must not be taken for its motion.
+
     Args:
         camera: that takes the frames.
         surface: of the thing.
     """
+
+    least_foreground = 1.0
 
     def __init__(self, camera: CameraModel, surface: Surface) -> None:
         self.camera, self.surface = camera, surface

@@ -73,7 +73,7 @@ def in_part(record: Record, part: str) -> bool:
     return part in ("all", own)
 
 
-def parts_of(entry: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def parts_of(entry: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """The entries of the two parts, of a model's entry in `servo.json`."""
     return entry["by_axis_share"] if "by_axis_share" in entry else entry["by_part"]
 

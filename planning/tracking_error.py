@@ -51,14 +51,15 @@ def main(config: Config) -> None:
             setup = task.make_setup(env, index, config.seed)
             observation = setup.start(env)
             mark, act = mark_of(setup), mover(env, np.random.default_rng((config.seed, index)))
-            assert mark is not None and task.surface is not None  # points on things
+            start = setup.goal.designated
+            assert mark is not None and start is not None and task.surface is not None  # points on things
             follower = SurfaceFollower(env.unwrapped.camera, task.surface)  # type: ignore[attr-defined]
             follower.reset(observation, setup.goal)
             for _ in range(config.steps):
                 observation, *_ = env.step(act(observation))
                 follower.observe(observation)
                 errors.append(1e3 * np.linalg.norm(follower.point - mark.position(env)))
-                ways.append(1e3 * np.linalg.norm(mark.position(env) - setup.goal.designated))
+                ways.append(1e3 * np.linalg.norm(mark.position(env) - start))
         env.close()
         numbers = [np.max(ways), np.mean(errors), np.quantile(errors, 0.95), np.max(errors)]
         print(env_name, point, config.episodes, *(f"{number:.1f}" for number in numbers))

@@ -48,11 +48,13 @@ class HandTrack:
         tcp: (N, 3).
         points: (N, M, 3).
         K: (3, 3) intrinsics, pixel centres at integers.
+        least: below this share of anything that moves, the body counts as still; 1 for blended transforms as they are.
     """
 
     tcp: Tensor
     points: Tensor
     K: Tensor
+    least: float = LEAST_FOREGROUND
 
     @classmethod
     def start(cls, points: Tensor, tcp: Tensor, K: Tensor, futures: int, radius: float = HAND_RADIUS) -> HandTrack:
@@ -89,9 +91,9 @@ class HandTrack:
         read = grid_sample(fields, grid[:, :, None], padding_mode="border", align_corners=True)  # (N, 13, M, 1)
         mean = read.squeeze(-1).mean(dim=2)  # (N, 13)
         still = torch.eye(3, 4, dtype=mean.dtype, device=mean.device)
-        behind = mean[:, 12, None, None].clamp(max=1 - LEAST_FOREGROUND)
+        behind = mean[:, 12, None, None].clamp(max=1 - self.least)
         motion = (mean[:, :12].unflatten(1, (3, 4)) - behind * still) / (1 - behind)  # (N, 3, 4)
         turn, shift = motion[..., :3].mT, motion[..., 3]
         points = self.points @ turn + shift[:, None]
         tcp = (self.tcp[:, None] @ turn)[:, 0] + shift
-        return HandTrack(tcp, points, self.K)
+        return HandTrack(tcp, points, self.K, self.least)

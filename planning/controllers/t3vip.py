@@ -29,7 +29,9 @@ class T3VIPController(LearnedController):
             actions = self.tensor(self.aggregated(sequences))  # (N, h, A)
             effector = self.in_camera(self.effector.path(observation, sequences, self.hold))  # (N, h, 3)
             future = state  # one past for all futures: the first step encodes it once
-            track = HandTrack(point.expand(count, 3), body.expand(count, *body.shape), intrinsics)
+            track = HandTrack(
+                point.expand(count, 3), body.expand(count, *body.shape), intrinsics, self.follower.least_foreground
+            )
             distances = []
             for step in range(actions.shape[1]):
                 last = step + 1 == actions.shape[1]  # nobody looks at its picture
