@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,8 @@ def in_part(record: Record, part: str) -> bool:
 
 def parts_of(entry: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """The entries of the two parts, of a model's entry in `servo.json`."""
-    return entry["by_axis_share"] if "by_axis_share" in entry else entry["by_part"]
+    parts: dict[str, dict[str, Any]] = entry["by_axis_share"] if "by_axis_share" in entry else entry["by_part"]
+    return parts
 
 
 def _share(records: Sequence[Record]) -> dict[str, Any]:
