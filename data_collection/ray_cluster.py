@@ -19,6 +19,7 @@ TRIES = 3
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",  # nothing is sent anywhere
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # a task without GPUs leaves CUDA_VISIBLE_DEVICES alone; Ray's new way
+    "RAY_DEDUP_LOGS_SKIP_REGEX": ".",  # not a word of Ray's own when a process or a machine dies: we say it
     "RAY_agent_register_timeout_ms": "300000",  # a busy machine needs more than the usual 30 s
     "RAY_worker_niceness": "0",  # as nice as this process, not by 15 nicer than whatever else runs
 }

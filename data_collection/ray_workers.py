@@ -14,6 +14,7 @@ import tempfile
 import time
 import traceback
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -92,7 +93,7 @@ class RayPool(WorkerPool["RayWorker"]):
         return int(ray.cluster_resources().get("CPU", 0))
 
     def hire(self, name: str, episode: int) -> RayWorker:
-        return RayWorker(name, self._actor.remote(self._manifest), self._folder, self._timeout, episode)
+        return RayWorker(name, lambda: self._actor.remote(self._manifest), self._folder, self._timeout, episode)
 
     def wait(self, crew: list[RayWorker]) -> list[RayWorker]:
         """As everywhere.
@@ -117,11 +118,15 @@ class RayPool(WorkerPool["RayWorker"]):
 class RayWorker(Worker):
     """An actor and what it has been asked, the oldest first."""
 
-    def __init__(self, name: str, actor: Any, folder: Path, timeout: float, episode: int) -> None:
+    def __init__(self, name: str, new_actor: Callable[[], Any], folder: Path, timeout: float, episode: int) -> None:
         super().__init__(name, timeout, episode)
         self.place = ""
-        self._actor, self._folder, self._hired = actor, folder, time.monotonic()
-        self._asked = deque([actor.where.remote(), actor.collect.remote(None), actor.collect.remote(episode)])
+        self._new_actor, self._folder, self._hired = new_actor, folder, time.monotonic()
+        self._start()
+
+    def _start(self) -> None:
+        actor = self._actor = self._new_actor()
+        self._asked = deque([actor.where.remote(), actor.collect.remote(None), actor.collect.remote(self.episode)])
         self.deadline = math.inf  # it may wait for a free CPU
 
     def __str__(self) -> str:
@@ -147,6 +152,9 @@ class RayWorker(Worker):
         try:
             answer: Answer = ray.get(self._asked.popleft())
         except RayError as error:
+            if _is_out_of_reach(error) and 0 < self.waits_for_place < START_SECONDS:
+                self._start()  # it was given to a machine that had gone: nothing is lost
+                return None
             return "failed", _describe_death(error)
         if answer.kind == "placed":
             self.place = answer.detail
@@ -177,9 +185,13 @@ class RayWorker(Worker):
 
 
 def _describe_death(error: RayError) -> str:
-    said = str(error)
-    if isinstance(error, ActorDiedError):
-        return "its machine left the cluster" if "its node has died" in said else "its process died"
-    if isinstance(error, ActorUnavailableError):
-        return "it cannot be reached any more"
-    return f"{type(error).__name__}: {said.splitlines()[0]}"
+    if _is_out_of_reach(error):
+        return "its machine cannot be reached any more"
+    if isinstance(error, ActorDiedError) and not error.actor_init_failed:
+        return "its process died"
+    lines = str(error).strip().splitlines() or [""]
+    return f"{type(error).__name__}: {lines[-1] if isinstance(error, ActorDiedError) else lines[0]}"
+
+
+def _is_out_of_reach(error: RayError) -> bool:
+    return isinstance(error, ActorUnavailableError) or "its node has died" in str(error)
