@@ -5,16 +5,16 @@ from __future__ import annotations
 from data_collection.policies.base import Policy
 from envs.errors import UsageError
 
-POLICIES = ("play", "push", "predictive", "noise", "random")
+POLICIES = ("play", "push", "poke", "predictive", "noise", "random")
 
 
 def make_policy(name: str) -> Policy:
     """A new policy.
 
     Args:
-        name: "play" and "push" (scripts for the tabletop and for planar pushing) and "predictive" (a search, for the
-            dexterous hand), which look into the simulator, "noise" (coloured noise), "random" (uniform), or what
-            `stable_baselines.policy_name` gives.
+        name: "play" (a script for the tabletop), "push" and "poke" (scripts for planar pushing) and "predictive" (a
+            search, for the dexterous hand), which look into the simulator, "noise" (coloured noise), "random"
+            (uniform), or what `stable_baselines.policy_name` gives.
 
     Raises:
         UsageError: no such policy, or a policy file that cannot be loaded.
@@ -27,6 +27,10 @@ def make_policy(name: str) -> Policy:
         from data_collection.policies.push import PushPolicy
 
         return PushPolicy()
+    if name == "poke":
+        from data_collection.policies.poke import PokePolicy
+
+        return PokePolicy()
     if name == "predictive":
         from data_collection.policies.predictive import PredictivePolicy
 

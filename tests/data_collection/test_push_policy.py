@@ -15,10 +15,10 @@ from envs.tabletop import TabletopEnv
 STEPS = 120
 
 
-def episode(env: PlanarPushEnv, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def episode(env: PlanarPushEnv, seed: int, name: str = "push") -> tuple[np.ndarray, np.ndarray]:
     """Actions (T, 3) and poses of the object (T + 1, 3)."""
     observation, _ = env.reset(seed=seed)
-    policy = make_policy("push")
+    policy = make_policy(name)
     policy.reset(env, np.random.default_rng(seed))
     actions, poses = [], [env.object_pose]
     for _ in range(STEPS):
@@ -54,6 +54,22 @@ def test_pushes_move_the_object_and_ways_round_it_do_not():
     assert np.median(moved) > 0.03
     assert max(brushed) < 0.01
     assert max(off_line) < 1e-3  # a push is straight, along its heading
+
+
+def test_pokes_hit_and_miss_whatever_their_heading():
+    env = PlanarPushEnv("all", images=False)
+    along, moved = [], []
+    for seed in range(6):
+        actions, poses = episode(env, seed, "poke")
+        assert np.abs(actions).max() <= 1 and np.abs(poses[:, :2]).max() < 0.2
+        headings = np.pi * actions[:, 2]
+        directions = np.stack([np.cos(headings), np.sin(headings)], axis=1)
+        along.append((actions[:, :2] * directions).sum(1) > 0.99 * np.linalg.norm(actions[:, :2], axis=1))
+        moved.append(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1) > 1e-3)
+    env.close()
+    along, moved = np.concatenate(along), np.concatenate(moved)
+    assert 0.2 < moved[along].mean() < 0.8  # moving along the heading need not move the object
+    assert moved[~along].mean() > 0.1  # nor need it be the heading's direction that does
 
 
 def test_the_same_seed_gives_the_same_episode():
