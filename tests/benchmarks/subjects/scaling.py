@@ -20,16 +20,27 @@ from worldmodel.trainer import Trainer
 COMPUTE = ("convolution", "mm", "linear", "addmm")
 """In the name of an operator whose operands no fusion keeps out of memory."""
 SHARES: dict[str, tuple[str, ...]] = {
-    "convolutions, backward": ("convolution_backward", "conv_transpose"),
-    "convolutions, forward": ("convolution", "conv2d"),
+    "compiled (gates, nearest neighbours)": ("CompiledFxGraph", "Torch-Compiled", "TorchDynamo", "_Gates"),
+    "convolutions, backward": ("convolution_backward", "ConvolutionBackward"),
+    "convolutions, forward": ("convolution", "conv2d", "conv_transpose2d"),
     "layer norms": ("group_norm",),
-    "splatting": ("grid_sampler",),
-    "matrix products": ("mm", "linear", "matmul"),
-    "compiled pointwise (gates, nearest neighbours)": ("Torch-Compiled", "CompiledFunction", "cpp_fused", "triton"),
-    "copies, casts, joins": ("copy_", "_to_copy", "cat", "contiguous", "clone", "empty", "fill", "zero"),
+    "splatting": ("grid_sampler", "_BilinearSplat"),
+    "matrix products": ("aten::mm", "aten::bmm", "addmm", "aten::linear", "matmul"),
+    "copies, casts, joins": (
+        "copy_",
+        "_to_copy",
+        "aten::cat",
+        "_Join",
+        "contiguous",
+        "clone",
+        "empty",
+        "fill_",
+        "zero",
+    ),
     "Adam": ("_foreach", "_fused_adam", "Optimizer"),
 }
-"""What an operator's own time counts as: the first whose words are in its name. Everything else is `other`."""
+"""What an operator's own time counts as: the first whose words are in its name. The rest, small operators for each
+pixel above all, is `other`."""
 
 
 def step(preset: str, batch: int, width: float, frames: int, precision: str, repeats: int) -> dict[str, float]:
