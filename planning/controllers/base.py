@@ -63,11 +63,15 @@ class HoldingController:
         start = time.perf_counter()
         self.follower.observe(observation)
         if self._steps % self.hold == 0:
-            self.effector.aim(self.goal.point_world - self.follower.point)
+            self.effector.aim(self.way())
             self.action = self.effector.action(self.decide(observation))
             self.plan_seconds.append(time.perf_counter() - start)
         self._steps += 1
         return self.action
+
+    def way(self) -> NDArray[np.float64]:
+        """Where the point has yet to go (3,), metres, world frame, by what the controller knows."""
+        return self.goal.point_world - self.follower.point
 
     def decide(self, observation: Observation) -> NDArray:
         """The move (axes,), within the effector's limit, to hold from this observation on."""

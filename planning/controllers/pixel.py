@@ -35,6 +35,14 @@ class PixelController(LearnedController):
     def reset(self, observation: Observation, goal: Goal) -> None:
         super().reset(observation, replace(goal, point_world=np.full(3, np.nan)))
 
+    def way(self) -> NDArray[np.float64]:
+        """To where the ray through the goal's pixel is as high as the point."""
+        camera, point = self.camera, self.follower.point
+        eye = camera.world_T_camera[:3, 3]
+        along = camera.to_world(np.linalg.solve(camera.K, np.append(self.goal.pixel, 1.0))) - eye
+        flat = abs(along[2]) < 1e-6  # a ray that meets no table
+        return np.zeros(3) if flat else eye + (point[2] - eye[2]) / along[2] * along - point
+
     def imagine(self, observation: Observation) -> CostFunction:
         state = self.observed()
         start = PixelTrack.start(self.distribution(self.designated[-1]), self.distribution(self.designated[0]))
