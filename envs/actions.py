@@ -31,9 +31,9 @@ def clip_sequences(actions: ArrayLike, size: int) -> NDArray[np.float64]:
     """Sequences of actions as (N, T, size) float64, clipped to [-1, 1].
 
     Raises:
-        UsageError: they have another shape, or are not finite.
+        UsageError: they have another shape, are not finite, or are none.
     """
     checked = np.asarray(actions, np.float64)
-    if checked.ndim != 3 or checked.shape[2] != size or not np.isfinite(checked).all():
-        raise UsageError(f"actions have shape {checked.shape}; give finite numbers of shape (N, T, {size})")
+    if checked.ndim != 3 or checked.shape[2] != size or not checked.size or not np.isfinite(checked).all():
+        raise UsageError(f"actions have shape {checked.shape}; give finite numbers (N, T, {size}), N and T above 0")
     return np.clip(checked, -1.0, 1.0)

@@ -63,5 +63,5 @@ def test_noise_goes_on_after_its_block():
 
 
 def test_unknown_policy_lists_the_known():
-    with pytest.raises(UsageError, match="'teleport'; choose one of play, push, predictive, noise, random"):
+    with pytest.raises(UsageError, match="'teleport'; choose one of play, push, poke, predictive, noise, random"):
         make_policy("teleport")
