@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import json
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -52,21 +53,33 @@ def remove_leftovers(folder: Path) -> list[str]:
 
 
 @contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Be the only process that writes datasets in `folder`; the kernel frees the lock when the process dies.
+def locked(folder: Path, patience: float = 0.0) -> Iterator[int]:
+    """Be the only process that writes in `folder`; the kernel frees the lock when the process dies.
+
+    Args:
+        folder: to write in.
+        patience: seconds to wait for another process to end.
+
+    Yields:
+        The lock's file descriptor: a child process that inherits it holds the lock too.
 
     Raises:
         UsageError: another process holds it.
     """
     handle = os.open(folder / LOCK_NAME, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o644)
+    deadline = time.monotonic() + patience
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise UsageError(
-                f"another process is writing to {folder}; wait for it to end, or choose another folder"
-            ) from error
-        yield
+        while True:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if time.monotonic() >= deadline:
+                    raise UsageError(
+                        f"another process is writing to {folder}; wait for it to end, or choose another folder"
+                    ) from error
+                time.sleep(0.2)
+        yield handle
     finally:
         os.close(handle)
 

@@ -90,14 +90,15 @@ def save_model(
 
 
 def find_model(name: str | Path) -> Path:
-    """The folder of a model: a shipped name, a training run, or a folder with config.json and weights.
+    """The folder of a model: a training run, a folder with config.json and weights, or a shipped name.
 
     Shipped models of the tabletop go by their kind (`t3vip`), others by environment and kind (`planar-push/t3vip`).
+    A folder of that name in the working directory comes first.
 
     Raises:
         UsageError: nothing of that kind is there.
     """
-    for folder in (PRETRAINED / name, Path(name), Path(name) / "model", Path(name) / "model.old"):
+    for folder in (Path(name), Path(name) / "model", Path(name) / "model.old", PRETRAINED / name):
         if (folder / WEIGHTS).is_file() and (folder / CONFIG).is_file():
             return folder
     raise UsageError(
@@ -212,7 +213,7 @@ def load_training(run: Path, modules: Mapping[str, nn.Module], optimiser: torch.
             optimiser.state[parameter] = {
                 key: value.to(parameter.device if optimiser.defaults.get("fused") else "cpu", copy=True)
                 if key == "step"
-                else value.to(parameter.device).clone(memory_format=torch.preserve_format)
+                else torch.empty_like(parameter).copy_(value)  # laid out as the weights are: fused Adam insists
                 for key, value in moments.items()
             }
     return state

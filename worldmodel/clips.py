@@ -187,7 +187,7 @@ class ClipSource:
         """Mean and standard deviation of aggregated actions, (A,) each; a dimension that never changes gets 1."""
         actions = self.actions_at(self.spread(samples, 2), 2)[:, 0].astype(np.float64)
         std = actions.std(0)
-        return actions.mean(0), np.where(std > 1e-3, std, 1.0)
+        return actions.mean(0), np.where(std > 1e-4 * np.abs(actions).max(0), std, 1.0)  # in whatever unit they are
 
     def _hold(self, names: Sequence[str]) -> None:
         for name in names:

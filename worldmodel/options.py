@@ -121,6 +121,11 @@ class TrainOptions:
             raise UsageError(f"memory-limit is {self.memory_limit}; give GB, or 0 to read everything from the disk")
         if self.learning_rate <= 0:
             raise UsageError(f"learning-rate is {self.learning_rate}; give a positive number such as 1e-3")
+        if not self.clip_gradient > 0:
+            raise UsageError(f"clip-gradient is {self.clip_gradient}; give a positive number, inf for no limit")
+        for name in ("colour_jitter", "seed"):
+            if not getattr(self, name) >= 0:
+                raise UsageError(f"{name.replace('_', '-')} is {getattr(self, name)}; give 0 or more")
         shortest = min(frames for _, frames in self.schedule.clip_lengths)
         if not 1 <= self.context < shortest:
             raise UsageError(

@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 
-from data_collection.files import LOCK_NAME, write_json, written_aside
+from data_collection.files import locked, write_json, written_aside
 from envs import command as command_line
 from envs.errors import UsageError
 from worldmodel.study import figures, report
@@ -27,7 +21,7 @@ def main(options: StudyOptions) -> None:
     """Train and score what is not trained and scored yet; write the report after each model."""
     check_lengths(options)
     options.out.mkdir(parents=True, exist_ok=True)
-    with _locked(options.out) as lock:
+    with locked(options.out, PATIENCE_S) as lock:
         _claim(options)
         _write(options)  # now, not hours later: is each run that is there one of this study?
         for number, contestant in enumerate(options.chosen, 1):
@@ -65,31 +59,6 @@ def _write(options: StudyOptions) -> None:
     if document["models"]:
         figures.draw_curves(document, options.out / "curves.png")
         figures.draw_bars(document, options.out / "bars.png")
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[int]:
-    """Be the only study in this folder; gives the lock's file descriptor, for a trainer to hold it too.
-
-    Raises:
-        UsageError: another study, or the trainer that one left behind, is still at work.
-    """
-    handle = os.open(folder / LOCK_NAME, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o644)
-    deadline = time.monotonic() + PATIENCE_S
-    try:
-        while True:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError as error:
-                if time.monotonic() > deadline:
-                    raise UsageError(
-                        f"another process is at work in {folder}; wait for it to end, or give another --out"
-                    ) from error
-                time.sleep(0.2)
-        yield handle
-    finally:
-        os.close(handle)
 
 
 def command() -> None:

@@ -148,8 +148,8 @@ def splat(
     if mode == "over":
         weights = in_front * _visible(pixels.detach(), depth.detach(), in_front).clamp(min=MIN_WEIGHT)
     if mode == "softmax" and sharpness > 0:
-        # Shifting by the mean leaves the result as it is and keeps the exponential within range.
-        weights = in_front * torch.exp((sharpness * (depth.mean((1, 2, 3), keepdim=True) - depth)).clamp(-30, 30))
+        # Shifting by the mean leaves the result as it is. The range keeps far points above the divisor's least value.
+        weights = in_front * torch.exp((sharpness * (depth.mean((1, 2, 3), keepdim=True) - depth)).clamp(-20, 20))
     landed = splat_sum(torch.cat((values * weights, weights, in_front), dim=1), pixels)
     picture, total, coverage = landed.split((values.shape[1], 1, 1), dim=1)
     if mode == "sum":

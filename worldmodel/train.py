@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from data_collection.files import write_json
+from data_collection.files import locked, write_json
 from envs import command as command_line
 from envs.errors import UsageError
 from worldmodel.budget import Cost, measure_cost
@@ -45,11 +46,19 @@ def train_with(ranks: Ranks, options: TrainOptions) -> None:
     def prepare(options: TrainOptions) -> Trainer:
         return make_trainer(options, train, validation, ranks)
 
-    chosen = ranks.decide(lambda: existing_run(options))
-    if chosen is None:
-        cost = None if options.minutes is None else measure_cost(prepare, options)  # all train, all measure
-        chosen = ranks.decide(lambda: claim(_filling(options, cost)))
-    prepare(chosen).run()
+    with ExitStack() as stack:
+        ranks.decide(lambda: stack.enter_context(_alone_in(options.out)))
+        chosen = ranks.decide(lambda: existing_run(options))
+        if chosen is None:
+            cost = None if options.minutes is None else measure_cost(prepare, options)  # all train, all measure
+            chosen = ranks.decide(lambda: claim(_filling(options, cost)))
+        prepare(chosen).run()
+
+
+def _alone_in(folder: Path) -> AbstractContextManager[int]:
+    """The lock of a run's folder, which is made if need be."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return locked(folder)
 
 
 def make_trainer(options: TrainOptions, train: ClipSource, validation: ValidationSet, ranks: Ranks) -> Trainer:

@@ -7,7 +7,7 @@ import logging
 import math
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
@@ -29,6 +29,7 @@ from worldmodel.options import TrainOptions
 from worldmodel.pictures import picture_prediction
 from worldmodel.ranks import ALONE, Ranks
 from worldmodel.rollout import Rollout, unroll
+from worldmodel.scores import number
 from worldmodel.t3vip import T3VIP
 from worldmodel.validation import Scores, ValidationSet, summary, validate
 from worldmodel.world_model import WorldModel
@@ -94,6 +95,7 @@ class Trainer:
         state = load_training(options.out, self.modules, self.optimiser)
         if state is not None:
             self.step, self.best, self.seconds = state["step"], state["best"], state["seconds"]
+            self._check_data(state.get("data"))
         self.ranks.begin_alike(self.parameters, self.step)
         first = self.ranks.first
         writer = SummaryWriter(str(options.out / "tensorboard"), purge_step=self.step) if first else None
@@ -137,31 +139,39 @@ class Trainer:
     def update(self, clips: Clips) -> dict[str, float]:
         """One step of Adam on a batch of clips; returns the terms of the loss.
 
-        A loss that is not finite skips the step; several in a row end the run.
+        A loss or gradient that is not finite skips the step; several in a row end the run.
         """
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate
         total, terms = self.objective(clips)
         bad = [name for name, value in terms.items() if not math.isfinite(value)]
         if bad:
-            self.bad_steps += 1
-            logger.warning("step %d skipped: %s not finite", self.step, ", ".join(bad))
-            if self.bad_steps >= MAX_BAD_STEPS:
-                raise Diverged(
-                    f"the loss was not finite {MAX_BAD_STEPS} steps in a row (terms: {', '.join(bad)}); look for bad "
-                    "frames with inspect-dataset, or lower --learning-rate"
-                )
+            self._skip(f"loss (terms: {', '.join(bad)})")
             return terms
-        self.bad_steps = 0
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()
         self.ranks.average_gradients(self.parameters)
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.options.clip_gradient)
         if torch.isfinite(norm):
             self.optimiser.step()
+            self.bad_steps = 0
         else:
-            logger.warning("step %d skipped: gradient not finite", self.step)
+            self._skip("gradient")
         return terms
+
+    def _skip(self, what: str) -> None:
+        """Leave the weights alone for a step.
+
+        Raises:
+            Diverged: for too many steps in a row.
+        """
+        self.bad_steps += 1
+        logger.warning("step %d skipped: %s not finite", self.step, what)
+        if self.bad_steps >= MAX_BAD_STEPS:
+            raise Diverged(
+                f"not finite {MAX_BAD_STEPS} steps in a row: {what}; look for bad frames with inspect-dataset, or "
+                "lower --learning-rate"
+            )
 
     def objective(self, clips: Clips) -> tuple[Tensor, dict[str, float]]:
         """The full objective (paper, section III-F) on this rank's clips, and its unweighted terms on those of all.
@@ -246,18 +256,28 @@ class Trainer:
         score = float(scores["score"])  # type: ignore[arg-type]
         if score >= self.best:
             self.best = score
-            origin = self.origin | {"step": self.step, "seconds": round(self.seconds), "validation": scores}
+            origin = self.origin | {"step": self.step, "seconds": round(self.seconds), "validation": _finite(scores)}
             save_model(self.model, self.options.out / "model", origin, self.inference)
         return scores
 
     def save(self) -> None:
         """Write a checkpoint to go on from."""
-        state = {"step": self.step, "best": self.best, "seconds": self.seconds}
+        state = {"step": self.step, "best": self.best, "seconds": self.seconds, "data": self.origin.get("data")}
         save_training(self.options.out, self.modules, self.optimiser, state)
+
+    def _check_data(self, before: dict[str, str] | None) -> None:
+        """Refuse to go on with other data: clips, held-out episodes and the scale of the actions would change."""
+        now = self.origin.get("data")
+        if before is not None and before != now:  # checkpoints of old do not say
+            changed = ", ".join(name for name in before if now is None or before[name] != now.get(name))
+            raise UsageError(
+                f"the data has changed since step {self.step} of {self.options.out} ({changed}); restore it, or give "
+                "another --out"
+            )
 
     def _log(self, writer: SummaryWriter, kind: str, values: dict[str, Any]) -> None:
         with (self.options.out / "metrics.jsonl").open("a") as file:
-            file.write(json.dumps({"kind": kind, "step": self.step, **values}) + "\n")
+            file.write(json.dumps({"kind": kind, "step": self.step, **_finite(values)}, allow_nan=False) + "\n")
         for name, value in values.items():
             numbers = value if isinstance(value, list) else [value]
             writer.add_scalar(f"{kind}/{name}", numbers[-1], self.step)
@@ -289,6 +309,13 @@ def reconstruction_terms(
         flow = rollout.stack("optical_flow").flatten(0, 1)
         terms["optical_smoothness"] = losses.edge_aware_smoothness(flow, pictures)
     return terms
+
+
+def _finite(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Numbers and lists of them for JSON, which knows no NaN and no infinity: None in their place."""
+    return {
+        name: [number(v) for v in value] if isinstance(value, list) else number(value) for name, value in values.items()
+    }
 
 
 def _ramp(x: float, low: float, high: float) -> float:

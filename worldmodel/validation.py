@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 import torch
@@ -61,7 +62,8 @@ def validate(model: WorldModel, data: ValidationSet, still: bool = False) -> Sco
         (metres) and `depth_psnr` (dB; its peak is the camera's working range, far less near). Means: `score` (RGB PSNR,
         of T3VIP plus depth PSNR, in dB: the paper's tuning metric); of T3VIP `inpainted` (share of pixels) and, with
         ground truth, the terms of `flow_scores`, one step ahead of true frames; of an arm `tracking_error`: how far
-        the moved TCP is off at the end of the clip, over how far it really went.
+        the moved TCP is off at the end of the clip, over how far it really went. A term that nothing moves for is
+        left out.
     """
     was_training = model.training
     model.eval()
@@ -109,11 +111,12 @@ def validate(model: WorldModel, data: ValidationSet, still: bool = False) -> Sco
     }
     if flows:
         predicted, true, hand = (torch.cat(parts) for parts in zip(*flows, strict=True))
-        scores.update(flow_scores(predicted, true, hand))
+        scores.update({name: value for name, value in flow_scores(predicted, true, hand).items() if isfinite(value)})
     if tracked:
         error, way = (torch.cat(parts) for parts in zip(*tracked, strict=True))
         counts = way > MIN_WAY_M
-        scores["tracking_error"] = float(error[counts].mean() / way[counts].mean())
+        if counts.any():
+            scores["tracking_error"] = float(error[counts].mean() / way[counts].mean())
     return scores
 
 
@@ -139,10 +142,11 @@ def summary(scores: Scores) -> str:
         share = _steps(scores["depth_rmse"])[-1] / _steps(scores["copy_depth_rmse"])[-1]
         line += f", depth RMSE {share:.2f} of copying's, inpainted {100 * float(scores['inpainted']):.1f} %"  # type: ignore[arg-type]
     if "flow_error_moving" in scores:
-        line += (
-            f", flow error {scores['flow_error_moving']:.2f} (hand {scores['flow_error_hand']:.2f}), false flow "
-            f"{1000 * float(scores['false_flow_m']):.2f} mm"  # type: ignore[arg-type]
-        )
+        line += f", flow error {scores['flow_error_moving']:.2f}"
+    if "flow_error_hand" in scores:
+        line += f" (hand {scores['flow_error_hand']:.2f})"
+    if "false_flow_m" in scores:
+        line += f", false flow {1000 * float(scores['false_flow_m']):.2f} mm"  # type: ignore[arg-type]
     if "tracking_error" in scores:
         line += f", tracking error {scores['tracking_error']:.2f}"
     return line

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from data_collection.dataset import RGBDDataset
 from envs import command as command_line
 from envs.errors import UsageError
-from worldmodel.checkpoint import load_model, shipped_models
+from worldmodel.checkpoint import PRETRAINED, find_model, load_model, shipped_models
 from worldmodel.clips import ClipSource
 from worldmodel.figure import Storyboard, write_film, write_sheet
 from worldmodel.pictures import predict, storyboard
@@ -156,7 +156,7 @@ def labels(models: Sequence[str]) -> dict[str, str]:
     short = {}
     for name in dict.fromkeys(models):
         folder = Path(name)
-        if name in shipped_models() and not folder.is_dir():
+        if name in shipped_models() and find_model(name).is_relative_to(PRETRAINED):
             short[name] = folder.name.upper()
         else:
             folder = folder.resolve()

@@ -89,7 +89,7 @@ class Kit:
             UsageError: there is no such checkpoint, or it was trained for another environment.
         """
         if name not in self._models:
-            shipped = FAMILIES[_family(_env_id(self.env))] + name
+            shipped = checkpoint.PRETRAINED / (FAMILIES[_family(_env_id(self.env))] + name)
             model = checkpoint.load_model(self.checkpoints.get(name, shipped), self.device)
             _check_fits(name, model, self.env)
             self._models[name] = model

@@ -87,6 +87,11 @@ def test_shipped_models_go_by_name(saved, tmp_path, monkeypatch):
     assert same(model, load_model("squares"))
     shutil.copytree(folder, tmp_path / "shipped" / "planar-push" / "squares")
     assert find_model("planar-push/squares") == tmp_path / "shipped" / "planar-push" / "squares"
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    shutil.copytree(folder, "squares")  # one's own of that name
+    for name in ("squares", "./squares"):
+        assert find_model(name).resolve() == tmp_path / "here" / "squares"
     with pytest.raises(UsageError, match=r"no model at 'circles'; .* shipped name \(squares, planar-push/squares\)"):
         load_model("circles")
 
@@ -154,6 +159,22 @@ def test_training_goes_on_with_weights_and_moments(tmp_path):
     first.learn()
     second.learn()  # the same only with Adam's moments and step
     assert torch.equal(first.weights(), second.weights())
+
+
+def test_moments_are_laid_out_as_their_weights_are(tmp_path):
+    """As Adam makes them at its first step; the fused one takes no others."""
+    run = Run()
+    run.modules["model"] = torch.nn.Conv2d(3, 4, 3).to(memory_format=torch.channels_last)
+    weights = run.modules["model"].weight
+    run.optimiser = torch.optim.Adam(run.modules["model"].parameters())
+    run.modules["model"](torch.ones(1, 3, 8, 8)).square().sum().backward()
+    run.optimiser.step()
+    made = {key: run.optimiser.state[weights][key].clone() for key in ("exp_avg", "exp_avg_sq")}
+    run.save(tmp_path, 1)
+    load_training(tmp_path, run.modules, run.optimiser)
+    for key, value in made.items():
+        loaded = run.optimiser.state[weights][key]
+        assert torch.equal(loaded, value) and loaded.stride() == value.stride() == weights.stride()
 
 
 def test_the_two_newest_are_kept_and_unfinished_ones_ignored(tmp_path):

@@ -130,8 +130,10 @@ def test_statistics_of_aggregated_actions(source, tmp_path, write_dataset):
     for shard in folder.glob("*.h5"):
         with h5py.File(shard, "r+") as file:
             file["action"][:, 6] = 1.0
+            file["action"][:, 0] = 1e-4 * file["action"][:, 0]  # some small unit
     mean, std = ClipSource(RGBDDataset(folder), GAP).action_statistics()
     assert mean[6] == 1 and std[6] == 1  # never divides by zero
+    assert 0 < std[0] < 1e-3
 
 
 def test_joint_deltas_in_place_of_commands(tmp_path, write_dataset):

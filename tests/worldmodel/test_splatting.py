@@ -118,6 +118,14 @@ def test_no_motion_gives_the_picture_back(mode):
     torch.testing.assert_close(coverage, torch.ones_like(coverage), atol=2e-5, rtol=0)
 
 
+@pytest.mark.parametrize("sharpness", [3.0, 15.0, 100.0])
+def test_a_far_surface_beside_a_near_one_is_not_dimmed(sharpness):
+    values, depth = torch.ones(1, 1, HEIGHT, WIDTH), torch.ones(1, 1, HEIGHT, WIDTH)
+    depth[..., WIDTH // 2 :] = 6.0
+    picture, _ = splat(values, pixel_grid(HEIGHT, WIDTH)[None], depth, "softmax", sharpness)
+    torch.testing.assert_close(picture, values, atol=1e-3, rtol=0)
+
+
 @pytest.mark.parametrize("mode", ["over", "average", "softmax", "sum"])
 def test_where_nothing_lands_there_is_nothing(mode):
     values, pixels, depth = layers(1.0)

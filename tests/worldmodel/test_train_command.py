@@ -10,6 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from data_collection.files import locked
 from envs.command import run
 from worldmodel.checkpoint import load_model
 from worldmodel.options import PRESETS, TrainOptions
@@ -76,6 +77,8 @@ def test_a_run_leaves_metrics_pictures_and_a_model_and_is_then_done(train, tmp_p
     assert not list(out.rglob("*.tmp"))
     assert train(*command)[0] == 0 and metrics(out) == lines  # the same command again has nothing to do
     assert_one_line(train(*command, "--learning-rate", 0.01), str(out), "learning_rate = 0.001, not 0.01", "--out")
+    with locked(out):
+        assert_one_line(train(*command), "another process is writing", str(out))
     (out / "config.json").write_text('{"steps": ')
     assert_one_line(train(*command), str(out / "config.json"), "damaged")
 
@@ -99,6 +102,9 @@ def test_a_validation_set_of_its_own(train, write_dataset, tmp_path):
         (["--steps", "0"], ["steps is 0", "at least 1"]),
         (["--steps", "many"], ["many"]),
         (["--learning-rate", "-1"], ["learning-rate is -1.0", "positive"]),
+        (["--clip-gradient", "0"], ["clip-gradient is 0.0", "inf for no limit"]),
+        (["--colour-jitter", "-1"], ["colour-jitter is -1.0", "0 or more"]),
+        (["--seed", "-1"], ["seed is -1", "0 or more"]),
         (["--context", "4"], ["context is 4", "1 to 3"]),
         (["--losses.knn", "-1"], ["knn is -1.0", "give 0"]),
         (["--architecture.masks", "1"], ["masks is 1", "at least 2"]),

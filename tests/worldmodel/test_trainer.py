@@ -144,9 +144,33 @@ def test_a_loss_that_is_no_number_is_skipped_and_ends_the_run_in_the_long_run(ma
     assert not untouched()
     for _ in range(MAX_BAD_STEPS - 1):
         trainer.update(spoiled(clips))
-    with pytest.raises(UsageError, match=r"not finite 10 steps in a row \(terms: loss, rgb\); look for bad frames"):
+    with pytest.raises(UsageError, match=r"in a row: loss \(terms: loss, rgb\); look for bad frames"):
         trainer.update(spoiled(clips))
     assert all(value.isfinite().all() for value in trainer.model.state_dict().values())
+
+
+def test_gradients_that_are_no_numbers_end_the_run_too(make_trainer, source, monkeypatch):
+    trainer = make_trainer()
+    clips = source.at(source.spread(2, 4), 4)
+    trainer.parameters[0].register_hook(lambda gradient: gradient * torch.nan)
+    weights = [parameter.clone() for parameter in trainer.parameters]
+    for _ in range(MAX_BAD_STEPS - 1):
+        trainer.update(clips)
+    with pytest.raises(UsageError, match="10 steps in a row: gradient; look for bad frames"):
+        trainer.update(clips)
+    assert all(torch.equal(now, before) for now, before in zip(trainer.parameters, weights, strict=True))
+
+
+def test_other_data_is_no_way_to_go_on(make_trainer):
+    first = make_trainer(steps=2, save_every=1)
+    first.origin["data"] = {"train": "a1", "validation": "b1"}
+    first.run()
+    same, other = make_trainer(steps=2), make_trainer(steps=2)
+    same.origin["data"] = dict(first.origin["data"])
+    same.run()
+    other.origin["data"] = {"train": "a2", "validation": "b1"}
+    with pytest.raises(UsageError, match=r"the data has changed since step 2 of .*run \(train\); restore it, or give"):
+        other.run()
 
 
 def test_frames_full_of_nothing_do_no_harm(make_trainer, source):

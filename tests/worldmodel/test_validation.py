@@ -1,6 +1,7 @@
 """Scores against references, and the scores of models whose scores are known."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 from torchmetrics.image import PeakSignalNoiseRatio
 
 from worldmodel import clips
+from worldmodel.clips import ClipSource
 from worldmodel.colours import colour_wheel
 from worldmodel.metrics import flow_scores, psnr_per_step, rmse_per_step
 from worldmodel.pictures import picture_prediction
@@ -59,6 +61,18 @@ def test_only_an_arm_has_a_tcp_to_track(make_model, validation, monkeypatch):
     scores = validate(make_model(), validation)
     assert "flow_error_moving" in scores and "tracking_error" not in scores
     assert "false flow" in summary(scores) and "tracking" not in summary(scores)
+
+
+def test_what_nothing_moves_for_has_no_score(make_model, validation, monkeypatch):
+    def truth_at(starts, frames):
+        truth = ClipSource.truth_at(validation.source, starts, frames)
+        return replace(truth, scene_flow=torch.zeros_like(truth.scene_flow), tcp=truth.tcp[:, :1].expand_as(truth.tcp))
+
+    monkeypatch.setattr(validation.source, "truth_at", truth_at)
+    scores = validate(make_model(), validation)
+    assert "false_flow_m" in scores
+    assert not {"flow_error_moving", "flow_error_hand", "tracking_error"} & scores.keys()
+    assert "false flow" in summary(scores) and "nan" not in summary(scores)
 
 
 def test_without_transforms_the_scores_are_those_of_copying(make_model, validation):
