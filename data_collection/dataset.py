@@ -47,10 +47,10 @@ class RGBDDataset:
     def __init__(self, path: str | Path, columns: Sequence[str] | None = None) -> None:
         self.path = Path(path)
         if not self.path.is_dir():
-            raise UsageError(f"no dataset folder {self.path}; make one with: collect-rollouts --out {self.path}")
+            raise UsageError(f"no dataset folder {self.path}; give one of collect-rollouts or import-dataset")
         paths = sorted(self.path.glob(SHARD_PATTERN))
         if not paths:
-            raise UsageError(f"no {SHARD_PATTERN} in {self.path}; collect with: collect-rollouts --out {self.path}")
+            raise UsageError(f"no {SHARD_PATTERN} in {self.path}; give a folder of collect-rollouts or import-dataset")
         self._shards = [read_shard(shard) for shard in paths]
         required = [name for name, column in COLUMNS.items() if column.required] if columns is None else list(columns)
         for shard in self._shards:
