@@ -92,7 +92,7 @@ def test_content_hash_is_of_the_content(folder, episodes, tmp_path_factory):
 def test_missing_folder_and_empty_folder(tmp_path):
     with pytest.raises(UsageError, match=r"no dataset folder .*nowhere; .*collect-rollouts"):
         RGBDDataset(tmp_path / "nowhere")
-    with pytest.raises(UsageError, match=r"no shard-\*\.h5 in .*; collect"):
+    with pytest.raises(UsageError, match=r"no shard-\*\.h5 in .*; give a folder of collect"):
         RGBDDataset(tmp_path)
 
 
