@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import io
 import os
 import select
@@ -64,13 +65,13 @@ def parse(
     Raises:
         UsageError: they do not parse, or `config` refuses them.
     """
-    box = io.StringIO()
+    box, about = io.StringIO(), inspect.getdoc(config)
     try:
         with contextlib.redirect_stderr(box):
             if default is None:
-                return tyro.cli(config, args=args, description=config.__doc__)
+                return tyro.cli(config, args=args, description=about)
             given = sys.argv[1:] if args is None else args
-            return tyro.cli(config, args=given, description=config.__doc__, default=default(given))
+            return tyro.cli(config, args=given, description=about, default=default(given))
     except SystemExit as stop:
         if stop.code != 2:  # --help
             raise

@@ -74,6 +74,11 @@ def test_same_command_goes_on_and_a_larger_number_extends(tmp_path):
             main(Config(**{**arguments(tmp_path, episodes=3), field: value}))
 
 
+def test_the_episodes_that_are_there_are_counted(tmp_path):
+    assert "2 episodes in" in call("collect-rollouts", options(tmp_path, episodes=2))[1]
+    assert "2 episodes in" in call("collect-rollouts", options(tmp_path, episodes=1))[1]
+
+
 def arguments(out, **changed):
     return {
         "out": out,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import imageio.v2 as imageio
@@ -10,13 +11,15 @@ import pytest
 from commands import call
 
 from data_collection import goal_scores, hand_pictures, train_policy
+from data_collection.collect import Config
 from data_collection.dataset import RGBDDataset
-from data_collection.environments import resolve_env, usual_policy
+from data_collection.environments import resolve_env, usual_policy, usual_steps
 from data_collection.policies import make_policy
 from data_collection.policies.predictive import PredictivePolicy, Settings
 from data_collection.policies.predictive_cost import Weights, step_costs
 from data_collection.policies.stable_baselines import load_model, policy_name
 from data_collection.rollout import collect_episode
+from envs import rotations
 from envs.dexhand import DexHandEnv, goals
 from envs.dexhand.simulate import BatchSimulator
 from envs.errors import UsageError
@@ -124,7 +127,7 @@ def test_costs_name_what_is_bad(env):
         return step_costs(Weights(), paths, action, pose if goal is None else goal)[0, 0]
 
     turned = pose.copy()
-    turned[3:] = goals.product([np.cos(0.25), 0, 0, np.sin(0.25)], pose[3:])
+    turned[3:] = rotations.multiply(np.array([np.cos(0.25), 0, 0, np.sin(0.25)]), pose[3:])
     assert cost() == 0
     assert cost(turned) == pytest.approx(0.5)
     assert cost(x=0.03) == pytest.approx(Weights().place * 0.01)
@@ -147,11 +150,16 @@ def test_bad_input_is_named():
 # --- Collecting ----------------------------------------------------------------------------------------------------
 
 
-def test_the_usual_policy_and_environment():
+def test_what_is_usual_in_an_environment(tmp_path):
     env_id, kwargs = resolve_env("dexhand", None)
     assert env_id == "t3vip/DexHand-v0"
     assert kwargs == {"new_goals": True}
     assert usual_policy("dexhand") == usual_policy(env_id) == "predictive"
+    assert usual_steps("dexhand") == usual_steps("envs:t3vip/DexHand-v0") == 100
+    assert usual_steps("tabletop") == usual_steps("planar-push") == usual_steps("other/Env-v0") == 240
+    config = Config(tmp_path, env="dexhand")
+    assert config.manifest().steps == 100
+    assert dataclasses.replace(config, steps=240).manifest().steps == 240
 
 
 def test_commands_and_joint_deltas_are_recorded():

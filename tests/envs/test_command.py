@@ -47,3 +47,16 @@ def test_another_broken_pipe_keeps_its_traceback():
 
     with pytest.raises(BrokenPipeError):
         run(Config, main, [])
+
+
+def test_paragraphs_of_the_help_begin_at_the_margin(capsys):
+    @dataclass
+    class Config:
+        """One thing.
+
+        And another.
+        """
+
+    with pytest.raises(SystemExit):
+        run(Config, lambda config: None, ["--help"])
+    assert "\nOne thing.\n\nAnd another.\n" in capsys.readouterr().out
