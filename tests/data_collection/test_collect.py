@@ -189,6 +189,14 @@ def test_bad_options_are_one_line(tmp_path, changed, words):
     assert_one_line_error(call("collect-rollouts", options(tmp_path / "data", **changed)), *words)
 
 
+def test_a_place_below_a_file_is_one_line(tmp_path):
+    file = tmp_path / "file"
+    file.touch()
+    assert_one_line_error(
+        call("collect-rollouts", options(file / "data")), f"cannot read or write {file}", "another place"
+    )
+
+
 def test_environment_that_does_not_observe_depth(tmp_path):
     with pytest.raises(UsageError, match="has no attribute 'camera'"):
         main(Config(**arguments(tmp_path, env="standin:standin/Blind-v0")))
