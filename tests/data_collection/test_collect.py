@@ -13,7 +13,9 @@ from standin import FAR, NEAR, StandIn, reset_seed
 
 from data_collection.collect import Config, main
 from data_collection.dataset import RGBDDataset
+from data_collection.episodes import EpisodeMaker
 from data_collection.files import locked
+from data_collection.manifest import Manifest
 from data_collection.policies.random import RandomPolicy
 from data_collection.repair import find_damage
 from data_collection.rollout import collect_episode
@@ -51,8 +53,8 @@ def test_episodes_and_runs_differ(collected):
     dataset = RGBDDataset(collected)
     actions = [dataset.episode(number)["action"] for number in range(4)]
     env = StandIn()
-    actions.append(collect_episode(env, RandomPolicy(), 8, seed=0, episode=0)["action"])
-    actions.append(collect_episode(env, RandomPolicy(), 8, seed=1, episode=0)["action"])
+    actions.append(collect_episode(env, RandomPolicy(), 8, seed=0, episode=0)[0]["action"])
+    actions.append(collect_episode(env, RandomPolicy(), 8, seed=1, episode=0)[0]["action"])
     for i in range(len(actions)):
         for j in range(i):
             assert not np.array_equal(actions[i], actions[j])
@@ -214,6 +216,20 @@ def test_damaged_shard_stops_resuming(collected, tmp_path):
     (tmp_path / "shard-00000.h5").write_bytes(b"")
     result = call("collect-rollouts", options(tmp_path, episodes=2))
     assert_one_line_error(result, "shard-00000.h5 is damaged", "inspect-dataset", "--repair")
+
+
+@pytest.mark.parametrize("terminates", [True, False])
+def test_the_environment_may_end_an_episode_and_the_dataset_says_how(tmp_path, terminates):
+    what = {"image_size": 16, "terminates": terminates}
+    manifest = Manifest("standin:standin/Ending-v0", what, "noise", seed=0, steps=8, ground_truth=False, episodes=1)
+    EpisodeMaker(manifest).write(0, tmp_path / "shard-00000.h5")
+    dataset = RGBDDataset(tmp_path)
+    assert dataset.episode_lengths.tolist() == [4]
+    assert dataset.episode_terminated.tolist() == [terminates]
+
+
+def test_episodes_whose_steps_are_up_have_not_terminated(collected):
+    assert not RGBDDataset(collected).episode_terminated.any()
 
 
 class _NanPolicy(RandomPolicy):

@@ -164,7 +164,8 @@ def test_what_is_usual_in_an_environment(tmp_path):
 
 def test_commands_and_joint_deltas_are_recorded():
     env = DexHandEnv(image_size=16, supersample=1)
-    columns = collect_episode(env, PredictivePolicy(Settings(stage=2, ahead=1, samples=4)), 5, 0, 0, ground_truth=True)
+    policy = PredictivePolicy(Settings(stage=2, ahead=1, samples=4))
+    columns, _ = collect_episode(env, policy, 5, 0, 0, ground_truth=True)
     assert columns["action"].shape == (6, 20)
     assert columns["joint_delta"].shape == (6, 24)
     assert not columns["joint_delta"][-1].any()
