@@ -208,13 +208,52 @@ def test_a_trained_policy_acts_in_the_collector(trained, tmp_path):
         hand_pictures.main(hand_pictures.Config(out, tmp_path, episode=1))
 
 
+def copy_of(trained, folder):
+    for path in (trained, trained.with_suffix(".json")):
+        (folder / path.name).write_bytes(path.read_bytes())
+    return folder / trained.name
+
+
 def test_training_goes_on_where_it_stopped(trained, tmp_path):
-    path = tmp_path / "hand.zip"
-    path.write_bytes(trained.read_bytes())
+    path = copy_of(trained, tmp_path)
     train_policy.main(train_policy.Config(path, steps=112, batch=8, buffer=500, trials=0))
     assert load_model(path).num_timesteps == 112
     with pytest.raises(UsageError, match="is not the policy it was"):
         make_policy(policy_name(trained).replace(str(trained), str(path)))
+
+
+def test_a_part_of_a_run_has_its_own_episodes_and_any_device(trained, tmp_path, monkeypatch):
+    devices = []
+
+    def load(path, device, **changes):
+        devices.append(device)
+        return load_model(path, device, **changes)
+
+    monkeypatch.setattr(train_policy, "load_model", load)
+    config = train_policy.Config(copy_of(trained, tmp_path), steps=112, batch=8, buffer=500)
+    hand = train_policy._make_env(config)
+    new = train_policy._model(dataclasses.replace(config, out=tmp_path / "new.zip"), hand)
+    start, action = new.env.reset()["observation"], new.action_space.sample()
+    resumed = train_policy._model(config, hand)
+    assert not np.array_equal(resumed.env.reset()["observation"], start)
+    assert not np.array_equal(resumed.action_space.sample(), action)
+    assert devices == ["auto"]
+    hand.close()
+
+
+def test_training_with_other_options_is_refused(trained, tmp_path):
+    path = copy_of(trained, tmp_path)
+    config = train_policy.Config(path, steps=112, batch=8, buffer=500, trials=0)
+    for name, value in (("algorithm", "td3"), ("reward", "dense"), ("goal_angle", 90.0), ("learning_rate", 0.1)):
+        with pytest.raises(UsageError, match=rf"was trained with {name} = .*, not {value!r}; .* another --out"):
+            train_policy.main(dataclasses.replace(config, **{name: value}))
+    path.with_suffix(".json").write_text("no options")
+    with pytest.raises(UsageError, match=r"hand\.json does not hold the options"):
+        train_policy.main(config)
+    path.with_suffix(".json").unlink()
+    with pytest.raises(UsageError, match=r"hand\.zip has no hand\.json beside it"):
+        train_policy.main(config)
+    assert path.read_bytes() == trained.read_bytes()
 
 
 def test_bad_policy_files_are_named(trained, tmp_path, env):
