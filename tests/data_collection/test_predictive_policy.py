@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import imageio.v2 as imageio
 import numpy as np
 import pytest
 from commands import call
 
-from data_collection import goal_scores, hand_pictures, train_policy
+from data_collection import hand_pictures, train_policy
 from data_collection.collect import Config
 from data_collection.dataset import RGBDDataset
 from data_collection.environments import resolve_env, usual_policy, usual_steps
@@ -278,27 +277,3 @@ def test_bad_policy_files_are_named(trained, tmp_path, env):
     code, _, err = call("collect-rollouts", ["--out", str(tmp_path / "d"), "--policy", "dance"])
     assert code == 2
     assert "'dance'" in err
-
-
-# --- Scores --------------------------------------------------------------------------------------------------------
-
-
-def test_scores_compare_policies_from_the_same_starts(tmp_path, capsys):
-    tasks = [
-        {"policy": name, "episode": n, "steps": 4, "goal_angle": 90.0, "seed": 0}
-        for name in ("random", "hold")
-        for n in range(2)
-    ]
-    rows = [goal_scores.play(task) for task in tasks]
-    for n in range(2):
-        assert rows[n]["errors"][0] == rows[2 + n]["errors"][0]
-    assert abs(rows[2]["errors"][-1] - rows[2]["errors"][0]) < 0.2  # nothing moves, nothing turns
-    assert len(rows[0]["errors"]) == 5
-    out = tmp_path / "goals.jsonl"
-    out.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    before = out.read_text()
-    goal_scores.main(goal_scores.Config(out, ("random", "hold"), episodes=2, steps=4))  # all is there already
-    assert out.read_text() == before
-    lines = capsys.readouterr().out.splitlines()
-    start = round(np.degrees(np.median([row["errors"][0] for row in rows[:2]])))
-    assert lines[2].startswith(f"| random | 2 | {start} |")
