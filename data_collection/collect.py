@@ -11,7 +11,7 @@ from types import FrameType
 
 from tqdm import tqdm
 
-from data_collection.environments import resolve_env, usual_policy, versions
+from data_collection.environments import resolve_env, usual_policy, usual_steps, versions
 from data_collection.files import locked, remove_leftovers
 from data_collection.manifest import MANIFEST_NAME, Manifest, read_manifest
 from data_collection.policies import POLICIES
@@ -39,8 +39,8 @@ class Config:
     validation, test, all, usually train)."""
     episodes: int = 400
     """Episodes the dataset shall have; a larger number extends it."""
-    steps: int = 240
-    """Actions in an episode, which has one frame more."""
+    steps: int | None = None
+    """Actions in an episode, which has one frame more; usually 240, with dexhand 100."""
     policy: str | None = None
     """Who acts: play (a script for the tabletop), push and poke (for planar-push: pushes as in Omnipush, or mixed with
     moves that miss), predictive (a search in the simulator, for dexhand), noise (smooth), random (uniform); usually the
@@ -54,7 +54,7 @@ class Config:
     """Have them on a Ray cluster: HOST:PORT of its head, auto for the one that runs here, local for one that is started
     here and ends with the command. The episodes are the same; only this process writes them."""
     image_size: int = 64
-    """Height and width of the images, pixels."""
+    """Height and width of the images, pixels; a multiple of 8 for the world model."""
     ground_truth: bool = False
     """Also record what a model never sees: body ids of the pixels and poses of the bodies (for scene flow)."""
     episode_timeout: float = 300.0
@@ -62,9 +62,10 @@ class Config:
 
     def __post_init__(self) -> None:
         for name, least in (("episodes", 1), ("steps", 1), ("workers", 1), ("seed", 0), ("image_size", 8)):
-            if getattr(self, name) < least:
+            value = getattr(self, name)
+            if value is not None and value < least:
                 option = name.replace("_", "-")
-                raise UsageError(f"--{option} is {getattr(self, name)}; give a whole number of at least {least}")
+                raise UsageError(f"--{option} is {value}; give a whole number of at least {least}")
         if not self.episode_timeout > 0:
             raise UsageError(f"--episode-timeout is {self.episode_timeout}; give a positive number of seconds")
         if self.policy is not None and self.policy not in POLICIES and not self.policy.endswith(SUFFIX):
@@ -83,7 +84,7 @@ class Config:
             env_kwargs={**env_kwargs, "image_size": self.image_size},
             policy=policy_name(Path(policy)) if policy.endswith(SUFFIX) else policy,
             seed=self.seed,
-            steps=self.steps,
+            steps=usual_steps(self.env) if self.steps is None else self.steps,
             ground_truth=self.ground_truth,
             episodes=self.episodes,
         )
@@ -104,7 +105,8 @@ def main(config: Config) -> None:
                 else:
                     lost = f"{event.worker} lost episode {event.episode}: {event.reason}"
                     progress.write(f"{lost}; replaced, the episode starts again", file=sys.stderr)
-    print(f"{config.episodes} episodes in {folder}; look at them with: inspect-dataset {folder}")
+        there = len(list(folder.glob(SHARD_PATTERN)))
+    print(f"{there} episodes in {folder}; look at them with: inspect-dataset {folder}")
 
 
 def _collect(config: Config, manifest: Manifest, missing: list[int]) -> Iterator[Collected | WorkerLost]:

@@ -121,6 +121,11 @@ class RGBDDataset:
         """(E,) number of each episode in the run that collected it; gaps where episodes were dropped."""
         return np.concatenate([shard.ep_index for shard in self._shards])
 
+    @property
+    def episode_terminated(self) -> NDArray[np.bool_]:
+        """(E,) whether each episode ended in a terminal state, as where a cube is dropped, before its steps were up."""
+        return np.concatenate([shard.ep_terminated for shard in self._shards]).astype(bool)
+
     def load(self, column: str) -> NDArray[Any]:
         """A whole column of all shards, (N, ...), in its stored dtype.
 

@@ -35,12 +35,14 @@ class KnownEnv:
     scene_keyword: str = ""
     """Keyword argument that a scene goes to; "" if it is part of the id."""
     kwargs: dict[str, Any] = field(default_factory=dict)
+    steps: int = 240
+    """Actions in an episode unless told otherwise."""
 
 
 KNOWN_ENVS: dict[str, KnownEnv] = {
     "tabletop": KnownEnv("t3vip/Tabletop{scene}-v0", scenes=("C", "A", "B", "D")),
     "planar-push": KnownEnv("t3vip/PlanarPush-v0", "push", ("train", "validation", "test", "all"), "split"),
-    "dexhand": KnownEnv("t3vip/DexHand-v0", "predictive", kwargs={"new_goals": True}),
+    "dexhand": KnownEnv("t3vip/DexHand-v0", "predictive", kwargs={"new_goals": True}, steps=100),
 }
 
 
@@ -66,6 +68,12 @@ def resolve_env(name: str, scene: str | None) -> tuple[str, dict[str, Any]]:
         raise UsageError(f"{name} has no scene '{scene}'; choose one of {', '.join(sorted(known.scenes))}")
     chosen = {known.scene_keyword: scene} if known.scene_keyword else {}
     return known.env_id.replace("{scene}", scene), {**known.kwargs, **chosen}
+
+
+def usual_steps(name: str) -> int:
+    """Actions in an episode of an environment, by its short name or Gymnasium id, unless told otherwise."""
+    families = (known for known in KNOWN_ENVS.values() if known.env_id.partition("{")[0] in name)
+    return (KNOWN_ENVS.get(name) or next(families, KnownEnv(name))).steps
 
 
 def usual_policy(name: str) -> str:

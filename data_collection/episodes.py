@@ -41,6 +41,8 @@ class EpisodeMaker:
         """
         run = self._manifest
         policy = make_policy(run.policy)
-        columns = collect_episode(self._env, policy, run.steps, run.seed, episode, run.ground_truth, on_step)
+        columns, terminated = collect_episode(
+            self._env, policy, run.steps, run.seed, episode, run.ground_truth, on_step
+        )
         on_step()
-        write_shard(path, [columns], self._attrs, [episode])
+        write_shard(path, [columns], self._attrs, [episode], [terminated])

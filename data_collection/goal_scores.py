@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ from envs.errors import UsageError
 
 EARLY = 25  # control steps, as long as a clip of the DexHand data
 HOLD = "hold"
+FIELDS = {"policy", "episode", "steps", "goal_angle", "seed", "reached", "dropped", "seconds_a_step", "errors"}
+"""What is recorded of an episode."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +68,9 @@ class HoldPolicy:
 def main(config: Config) -> None:
     """Run what is missing, then print a table."""
     common = {"steps": config.steps, "goal_angle": config.goal_angle, "seed": config.seed}
-    tasks = [{"policy": name, "episode": n, **common} for name in config.policies for n in range(config.episodes)]
-    done = [json.loads(line) for line in config.out.read_text().splitlines()] if config.out.exists() else []
+    policies = tuple(policy_name(Path(name)) if name.endswith(SUFFIX) else name for name in config.policies)
+    tasks = [{"policy": name, "episode": n, **common} for name in policies for n in range(config.episodes)]
+    done = read_rows(config.out) if config.out.exists() else []
     there = [{key: row[key] for key in ("policy", "episode", *common)} for row in done]
     missing = [task for task in tasks if task not in there]
     if missing:
@@ -77,29 +81,54 @@ def main(config: Config) -> None:
                 file.flush()
                 done.append(row)
     asked = [row for row in done if {key: row[key] for key in ("policy", "episode", *common)} in tasks]
-    print("\n".join(table(config.policies, asked)))
+    print("\n".join(table(policies, asked)))
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """The episodes that are in a file; a last line that a killed process left unfinished is cut off.
+
+    Raises:
+        UsageError: a line is no episode of this program.
+    """
+    content = path.read_bytes()
+    end = content.rfind(b"\n") + 1
+    rows = []
+    for number, line in enumerate(content[:end].splitlines(), 1):
+        try:
+            row = json.loads(line)
+        except ValueError as error:
+            raise UsageError(f"{path}, line {number} is no episode ({error}); remove that line") from error
+        if not isinstance(row, dict) or not row.keys() >= FIELDS:
+            raise UsageError(f"{path}, line {number} is no episode as it is recorded now; give another --out")
+        rows.append(row)
+    if end < len(content):
+        os.truncate(path, end)
+    return rows
 
 
 def play(task: dict[str, Any]) -> dict[str, Any]:
-    """One episode: the task, and rotation errors (rad) before each step and at the end, and whether it was dropped.
+    """One episode: the task, rotation errors (rad) before each step and at the end, whether a step reached the goal as
+    the environment means it, by angle and place, and whether the cube was dropped.
 
     Args:
-        task: policy, episode, steps, goal_angle, seed.
+        task: policy (a name, or what `policy_name` gives), episode, steps, goal_angle, seed.
     """
     env = DexHandEnv(goal_angle=task["goal_angle"], images=False)
     starts, own = np.random.SeedSequence((task["seed"], task["episode"])).spawn(2)
     obs, info = env.reset(seed=int(starts.generate_state(1)[0] >> 1))
     policy = _policy(task["policy"])
     policy.reset(env, np.random.default_rng(own))
-    errors, seconds = [info["rotation_error"]], time.process_time()
+    errors, reached, seconds = [info["rotation_error"]], False, time.process_time()
     for _ in range(task["steps"]):
         obs, _, terminated, _, info = env.step(policy.act(obs))
         errors.append(info["rotation_error"])
+        reached = reached or info["is_success"]
         if terminated:
             break
     seconds = (time.process_time() - seconds) / (len(errors) - 1)
     env.close()
-    return {**task, "dropped": info["is_dropped"], "seconds_a_step": seconds, "errors": [round(e, 4) for e in errors]}
+    ended = {"reached": reached, "dropped": info["is_dropped"], "seconds_a_step": seconds}
+    return {**task, **ended, "errors": [round(e, 4) for e in errors]}
 
 
 def table(policies: tuple[str, ...], rows: list[dict[str, Any]]) -> Iterator[str]:
@@ -111,8 +140,9 @@ def table(policies: tuple[str, ...], rows: list[dict[str, Any]]) -> Iterator[str
         steps = max(row["steps"] for row in own)
         errors = np.degrees([row["errors"] + row["errors"][-1:] * (steps + 1 - len(row["errors"])) for row in own])
         start, early, end = (np.median(errors[:, step]) for step in (0, min(EARLY, steps), steps))
-        reached = np.mean(errors.min(axis=1) < np.degrees(0.2))
-        dropped, seconds = (np.mean([row[key] for row in own]) for key in ("dropped", "seconds_a_step"))
+        reached, dropped, seconds = (
+            np.mean([row[key] for row in own]) for key in ("reached", "dropped", "seconds_a_step")
+        )
         yield (
             f"| {name} | {len(own)} | {start:.0f} | {early:.0f} | {end:.0f} | {reached:.0%} | {dropped:.0%} | "
             f"{1000 * seconds:.0f} |"
@@ -120,9 +150,7 @@ def table(policies: tuple[str, ...], rows: list[dict[str, Any]]) -> Iterator[str
 
 
 def _policy(name: str) -> Policy:
-    if name == HOLD:
-        return HoldPolicy()
-    return make_policy(policy_name(Path(name)) if name.endswith(SUFFIX) else name)
+    return HoldPolicy() if name == HOLD else make_policy(name)
 
 
 if __name__ == "__main__":

@@ -60,7 +60,8 @@ def _repair_shard(path: Path) -> list[str]:
     aside = _move_aside(path)
     if kept:
         attrs = {name: value for name, value in shard.attrs.items() if name != "schema"}
-        write_shard(path, episodes, attrs, [int(shard.ep_index[number]) for number in kept])
+        ended = [bool(shard.ep_terminated[number]) for number in kept]
+        write_shard(path, episodes, attrs, [int(shard.ep_index[number]) for number in kept], ended)
     dropped = ", ".join(str(index) for index, whole in zip(shard.ep_index, intact, strict=True) if not whole)
     return [f"dropped episode {dropped} of {path.name}: checksum differs; kept as {aside}"]
 

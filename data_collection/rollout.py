@@ -22,20 +22,20 @@ def collect_episode(
     episode: int,
     ground_truth: bool = False,
     on_step: Callable[[], None] = lambda: None,
-) -> dict[str, NDArray[Any]]:
+) -> tuple[dict[str, NDArray[Any]], bool]:
     """Roll out one episode; the same arguments give the same episode, whatever came before.
 
     Args:
         env: from `make_env`.
         policy: a fresh one.
-        steps: actions to execute; fewer if the environment terminates.
+        steps: actions to execute; fewer if the environment ends the episode.
         seed: of the run.
         episode: number of the episode in the run.
         ground_truth: also record segmentation and body poses.
         on_step: called before every step.
 
     Returns:
-        the columns of the schema, (steps + 1, ...) each.
+        the columns of the schema, (steps + 1, ...) each, and whether the episode ended in a terminal state.
     """
     env_seeds, policy_seeds = np.random.SeedSequence((seed, episode)).spawn(2)
     obs, info = env.reset(seed=int(env_seeds.generate_state(1)[0] >> 1))
@@ -45,26 +45,28 @@ def collect_episode(
     camera = env.unwrapped.camera  # type: ignore[attr-defined]
     rows: dict[str, list[Any]] = defaultdict(list)
     _record(rows, env, obs, info, ground_truth)
+    terminated = False
     for _ in range(steps):
         on_step()
         action = np.asarray(policy.act(obs), np.float32)
         if action.shape != space.shape or not np.isfinite(action).all():
             raise ValueError(f"the policy gave action {action}; it must be {space.shape} finite numbers")
         action = np.clip(action, space.low, space.high)
-        obs, reward, terminated, _, info = env.step(action)
+        obs, reward, terminated, truncated, info = env.step(action)
         rows["action"].append(action)
         rows["reward"].append(reward)
         if "joint_delta" in info:
             rows["joint_delta"].append(info["joint_delta"])
         _record(rows, env, obs, info, ground_truth)
-        if terminated:
+        if terminated or truncated:
             break
     rows["action"].append(np.zeros(space.shape))
     rows["reward"].append(0.0)
     if "joint_delta" in rows:
         rows["joint_delta"].append(np.zeros_like(rows["joint_delta"][-1]))
     rows["depth"] = [quantise_depth(frame, camera.near, camera.far) for frame in rows["depth"]]
-    return {name: np.stack(rows[name]).astype(COLUMNS[name].dtype) for name in COLUMNS if name in rows}
+    columns = {name: np.stack(rows[name]).astype(COLUMNS[name].dtype) for name in COLUMNS if name in rows}
+    return columns, bool(terminated)
 
 
 def _record(

@@ -15,6 +15,7 @@ shard-00007.h5
   ep_offset    (E,)            int64    first row of each episode
   ep_index     (E,)            int64    number of the episode in its run; with the run's seed it fixes the episode
   ep_hash      (E, 32)         uint8    SHA-256 of the episode's columns
+  ep_terminated (E,)           uint8    optional: 1 where an episode ended in a terminal state; none did without it
   attributes: numbers and JSON strings, `ATTRIBUTES`
 """
 
@@ -61,6 +62,7 @@ COLUMNS: dict[str, Column] = {
 }
 GROUND_TRUTH = ("segmentation", "body_pose")
 EPISODE_TABLES = ("ep_len", "ep_offset", "ep_index", "ep_hash")
+OPTIONAL_TABLE = "ep_terminated"
 
 NUMBERS = ("schema", "seed", "control_rate", "K", "world_T_camera", "near", "far")
 JSON_STRINGS = (
@@ -99,6 +101,7 @@ class Shard:
     ep_offset: NDArray[np.int64]
     ep_index: NDArray[np.int64]
     ep_hash: NDArray[np.uint8]
+    ep_terminated: NDArray[np.uint8]
     attrs: dict[str, Any]
 
     @property
@@ -147,6 +150,7 @@ def read_shard(path: Path) -> Shard:
             attrs = _read_attributes(path, file)
             stored = dict(file.items())
             tables = {name: stored.pop(name)[()] for name in EPISODE_TABLES if name in stored}
+            terminated = stored.pop(OPTIONAL_TABLE)[()] if OPTIONAL_TABLE in stored else None
             columns = {name: (column.shape, str(column.dtype)) for name, column in stored.items()}
     except (OSError, KeyError, RuntimeError, ValueError) as error:
         if isinstance(error, UsageError):
@@ -159,6 +163,10 @@ def read_shard(path: Path) -> Shard:
     starts = np.concatenate([[0], np.cumsum(tables["ep_len"])[:-1]]) if len(tables["ep_len"]) else tables["ep_len"]
     if not np.array_equal(starts, tables["ep_offset"]):
         raise DamagedShard(path, "ep_offset does not follow from ep_len")
+    if terminated is None:
+        terminated = np.zeros(len(starts), np.uint8)
+    if terminated.shape != starts.shape:
+        raise DamagedShard(path, f"{OPTIONAL_TABLE} is {terminated.shape}, for {len(starts)} episodes")
     for name, (shape, dtype) in columns.items():
         expected = COLUMNS.get(name)
         if expected is not None and (dtype != expected.dtype or len(shape) != expected.ndim):
@@ -166,7 +174,8 @@ def read_shard(path: Path) -> Shard:
             raise DamagedShard(path, f"column '{name}' is {dtype} {shape}, not {wanted}")
         if shape[:1] != (rows,):
             raise DamagedShard(path, f"column '{name}' has {shape[0] if shape else 0} rows, its episodes {rows}")
-    return Shard(path, {name: shape[1:] for name, (shape, _) in columns.items()}, **tables, attrs=attrs)
+    rest = {name: shape[1:] for name, (shape, _) in columns.items()}
+    return Shard(path, rest, **tables, ep_terminated=terminated, attrs=attrs)
 
 
 def _read_attributes(path: Path, file: h5py.File) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from data_collection.environments import resolve_env
-from data_collection.files import written_aside
+from data_collection.files import write_json, written_aside
 from data_collection.policies.stable_baselines import SUFFIX, load_model
 from envs.command import run
 from envs.errors import UsageError
@@ -21,6 +23,8 @@ DISCOUNT, POLYAK, GOALS_A_STEP = 0.98, 0.05, 4  # Plappert et al. (2018), but fo
 LEARNING_STARTS = 1000  # steps before the first update
 NOISE = 0.1  # standard deviation of DDPG's and TD3's exploration
 NETWORK = [256, 256, 256]
+MAY_CHANGE = ("out", "steps", "save_every", "trials")
+"""Options that a run may go on with others of; those that it must keep are in a .json beside the policy."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,7 @@ class Config:
     """Train a goal-conditioned policy from the simulator's state, without pictures. Same command: goes on."""
 
     out: Path
-    """The policy, a .zip file; written every `save_every` steps and at the end."""
+    """The policy, a .zip file; written every `save_every` steps and at the end. A .json beside it has the options."""
     env: str = "dexhand"
     """Environment with goals: a short name (dexhand), or a Gymnasium id."""
     algorithm: Literal["sac", "td3", "ddpg"] = "sac"
@@ -52,7 +56,7 @@ class Config:
     trials: int = 20
     """Episodes to try the policy in at the end; 0 for none."""
     seed: int = 0
-    """Decides goals, starts, weights and exploration."""
+    """Decides goals, starts, weights and exploration; a part of a run that goes on has its own."""
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "updates_every", "buffer", "save_every"):
@@ -66,12 +70,24 @@ class Config:
         if not self.learning_rate > 0:
             raise UsageError(f"--learning-rate is {self.learning_rate}; give a positive number")
 
+    @property
+    def options_file(self) -> Path:
+        """Where the options are that a run must keep."""
+        return self.out.with_suffix(".json")
+
+    def kept_options(self) -> dict[str, Any]:
+        """The options that a run must keep."""
+        return {name: value for name, value in dataclasses.asdict(self).items() if name not in MAY_CHANGE}
+
 
 def main(config: Config) -> None:
     """Train, save, try."""
+    if config.out.exists():
+        check_continues(config)
     env = _make_env(config)
     model = _model(config, env)
     config.out.parent.mkdir(parents=True, exist_ok=True)
+    write_json(config.options_file, config.kept_options())
     missing = config.steps - model.num_timesteps
     with tqdm(total=config.steps, initial=model.num_timesteps, unit="step", dynamic_ncols=True) as bar:
         if missing > 0:
@@ -80,6 +96,29 @@ def main(config: Config) -> None:
     print(f"{config.out}: {model.num_timesteps} steps; use it with: collect-rollouts --policy {config.out}")
     if config.trials:
         print(_trial(config, env, model))
+
+
+def check_continues(config: Config) -> None:
+    """Check that the policy that is there is one that these options made.
+
+    Raises:
+        UsageError: nothing says how it was trained, or it was trained with other options; names the first.
+    """
+    path = config.options_file
+    if not path.is_file():
+        raise UsageError(
+            f"{config.out} has no {path.name} beside it, so it is no run to go on with; choose another --out"
+        )
+    try:
+        before = dict(json.loads(path.read_text()))
+    except (ValueError, TypeError) as error:
+        raise UsageError(f"{path} does not hold the options of a run ({error}); choose another --out") from error
+    for name, asked in config.kept_options().items():
+        if before.get(name) != asked:
+            raise UsageError(
+                f"{config.out} was trained with {name} = {before.get(name)!r}, not {asked!r}; "
+                "run with the same options to go on with it, or choose another --out"
+            )
 
 
 def save(model: Any, path: Path) -> None:
@@ -109,8 +148,11 @@ def _model(config: Config, env: gymnasium.Env) -> Any:
     # relabelling needs a whole episode, and the buffer starts empty also where a run goes on
     first = max(min(LEARNING_STARTS, config.steps // 2), (env.spec.max_episode_steps or 0) + 1)
     if config.out.exists():
-        model = load_model(config.out, env=env)
+        model = load_model(config.out, device="auto", env=env)
         model.learning_starts = model.num_timesteps + first
+        # loading seeds as at the start: without others, each part of a run would begin with the same episodes
+        seeds = np.random.SeedSequence((config.seed, model.num_timesteps))
+        model.set_random_seed(int(seeds.generate_state(1)[0] >> 1))
         return model
     algorithm = {"sac": sb3.SAC, "td3": sb3.TD3, "ddpg": sb3.DDPG}[config.algorithm]
     assert env.action_space.shape is not None

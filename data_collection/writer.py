@@ -31,6 +31,7 @@ def write_shard(
     episodes: Sequence[Mapping[str, NDArray[Any]]],
     attrs: Mapping[str, Any],
     ep_index: Sequence[int],
+    ep_terminated: Sequence[bool] = (),
 ) -> None:
     """Write episodes into one shard, atomically.
 
@@ -39,6 +40,7 @@ def write_shard(
         episodes: for each its columns as the schema has them, (rows, ...) each; the same columns in all.
         attrs: the attributes as Python values, without `schema`.
         ep_index: number of each episode in its run.
+        ep_terminated: whether each episode ended in a terminal state; none did if not given.
 
     Raises:
         ValueError: a column is not what the schema says.
@@ -52,6 +54,8 @@ def write_shard(
         "ep_index": np.asarray(ep_index, np.int64),
         "ep_hash": np.stack([episode_hash(columns) for columns in episodes]),
     }
+    if any(ep_terminated):
+        tables["ep_terminated"] = np.array(ep_terminated, np.uint8)
     with written_aside(path) as aside, h5py.File(aside, "w", libver=("v110", "v110")) as file:
         for name, values in encode_attributes({"schema": SCHEMA_VERSION, **attrs}).items():
             file.attrs[name] = values

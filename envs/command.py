@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import inspect
 import io
 import os
 import select
@@ -17,6 +19,9 @@ from envs.errors import UsageError
 
 Config = TypeVar("Config")
 
+WRONG_PLACE = (PermissionError, NotADirectoryError, IsADirectoryError, FileExistsError)
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+
 
 def run(
     config: type[Config],
@@ -27,8 +32,9 @@ def run(
     """Parse the command line into `config` and hand it to `main`.
 
     A `UsageError`, from the options' own checks or from `main`, ends the process with one line on stderr and exit
-    code 2; so does an option that cannot be parsed; Ctrl-C ends it with 130. Where nobody reads on, as after `| head`,
-    it ends quietly with 141, as others do that SIGPIPE kills. Anything else is a bug and keeps its traceback.
+    code 2; so does an option that cannot be parsed, a file or folder that cannot be where it shall be, and a full disk.
+    Ctrl-C ends it with 130. Where nobody reads on, as after `| head`, it ends quietly with 141, as others do that
+    SIGPIPE kills. Anything else is a bug and keeps its traceback.
 
     Args:
         config: a dataclass whose field docstrings are the help text.
@@ -52,6 +58,12 @@ def run(
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes when it ends
         sys.exit(128 + signal.SIGPIPE)
+    except OSError as error:
+        told = _tell(error)
+        if told is None:
+            raise
+        print(f"error: {told}", file=sys.stderr)
+        sys.exit(2)
 
 
 def parse(
@@ -64,13 +76,13 @@ def parse(
     Raises:
         UsageError: they do not parse, or `config` refuses them.
     """
-    box = io.StringIO()
+    box, about = io.StringIO(), inspect.getdoc(config)
     try:
         with contextlib.redirect_stderr(box):
             if default is None:
-                return tyro.cli(config, args=args, description=config.__doc__)
+                return tyro.cli(config, args=args, description=about)
             given = sys.argv[1:] if args is None else args
-            return tyro.cli(config, args=given, description=config.__doc__, default=default(given))
+            return tyro.cli(config, args=given, description=about, default=default(given))
     except SystemExit as stop:
         if stop.code != 2:  # --help
             raise
@@ -85,6 +97,16 @@ def _reader_is_gone() -> bool:
     poll = select.poll()
     poll.register(sys.stdout.fileno(), 0)
     return bool(poll.poll(0))  # errors are told unasked
+
+
+def _tell(error: OSError) -> str | None:
+    """What the user can do about an error of the file system; None for one that is a bug."""
+    place, why = error.filename, error.strerror
+    if error.errno in NO_ROOM:
+        return f"cannot write {place or 'a file'} ({why}); make room, or choose a place that can be written to"
+    if isinstance(error, WRONG_PLACE) and place is not None:  # without a file, it is about a process or a socket
+        return f"cannot read or write {place} ({why}); choose another place, or change what is there"
+    return None
 
 
 def _one_line(box: str) -> str:

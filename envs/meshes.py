@@ -6,6 +6,7 @@ faster. Only what is drawn is touched, never a mesh that collides.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
 import os
@@ -40,6 +41,8 @@ class Mesh:
 def light_mesh(paths: Sequence[Path], max_faces: int = 500) -> Mesh:
     """The meshes of some files as one of at most `max_faces` triangles; computed once, then read from the cache.
 
+    The cache only saves time: where it cannot be read or written, the mesh is computed again.
+
     Args:
         paths: Wavefront `.obj` or binary `.stl` files in one common frame.
         max_faces: upper bound on the triangles.
@@ -48,11 +51,13 @@ def light_mesh(paths: Sequence[Path], max_faces: int = 500) -> Mesh:
     for path in paths:
         key.update(hashlib.sha256(path.read_bytes()).digest())
     cached = cache_dir() / "meshes" / f"{key.hexdigest()[:32]}.npz"
-    if cached.exists():
-        with np.load(cached, allow_pickle=False) as arrays:
-            return Mesh(arrays["vertices"], arrays["faces"])
+    with contextlib.suppress(OSError):
+        if cached.exists():
+            with np.load(cached, allow_pickle=False) as arrays:
+                return Mesh(arrays["vertices"], arrays["faces"])
     mesh = decimate(merge([read_mesh(path) for path in paths]), max_faces)
-    _store(cached, mesh)
+    with contextlib.suppress(OSError):
+        _store(cached, mesh)
     return mesh
 
 
@@ -126,7 +131,11 @@ def _store(path: Path, mesh: Mesh) -> None:
     """Write aside, then rename: workers that start together never see half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-        np.savez_compressed(file, vertices=mesh.vertices, faces=mesh.faces)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(file.name, path)
+        try:
+            np.savez_compressed(file, vertices=mesh.vertices, faces=mesh.faces)
+            file.flush()
+            os.fsync(file.fileno())
+            os.replace(file.name, path)
+        except BaseException:
+            os.unlink(file.name)
+            raise

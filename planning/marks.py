@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.tabletop import rotations
+from envs import rotations
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """A dataset as one HDF5 file of flat columns, as `stable-worldmodel` reads them (its format hdf5).
 
-pixels (N, H, W, 3) uint8, depth (N, H, W) float32 metres, action, proprio, state, reward, scene_obs where it is there
+pixels (N, H, W, 3) uint8, depth (N, H, W) float32 metres, and our other columns but for the ground truth
 ep_len (E,), ep_offset (E,): rows and first row of each episode
 attributes: those of our shards
 """
@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from data_collection.dataset import RGBDDataset
 from data_collection.files import written_aside
-from data_collection.schema import encode_attributes
+from data_collection.schema import COLUMNS, GROUND_TRUTH, encode_attributes
 from envs.errors import UsageError
 
 CHUNK_BYTES = 1 << 18
-COLUMNS = ("rgb", "depth", "action", "proprio", "state", "reward", "scene_obs")
 
 
 def export_flat_file(dataset: RGBDDataset, path: Path, on_episode: Callable[[], object] = lambda: None) -> None:
@@ -59,7 +58,7 @@ def export_flat_file(dataset: RGBDDataset, path: Path, on_episode: Callable[[], 
 
 def _columns(dataset: RGBDDataset, number: int) -> dict[str, NDArray[Any]]:
     stored = dataset.episode(number)
-    columns = {name: stored[name] for name in COLUMNS if name in stored}
+    columns = {name: stored[name] for name in COLUMNS if name in stored and name not in GROUND_TRUTH}
     columns["pixels"] = columns.pop("rgb")
     columns["depth"] = dataset.depth_metres(columns["depth"])
     return columns

@@ -2,8 +2,9 @@
 
 <root>/<name>/data/{main_data.hdf5, metadata.json}; an episode of T actions has
   observations  rgb (T+1, 3, H, W) uint8, depth (T+1, H, W) float32 metres, proprio (T+1, P) float32
-  actions       (T, A) float32          rewards (T,), terminations (T,) all false, truncations (T,) true in the last
-  infos         state, and scene_obs, segmentation, body_pose where the dataset has them, (T+1, ...) each
+  actions       (T, A) float32          rewards (T,)
+  terminations, truncations (T,)        in the last step one of them is true: the first after a terminal state
+  infos         our other columns: state, and the optional ones that the dataset has, (T+1, ...) each
   metadata      `rgbd`: camera, action_aggregation, action_scale, control_rate, and the rest of our attributes
 """
 
@@ -19,13 +20,13 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from data_collection.dataset import RGBDDataset
-from data_collection.schema import JSON_STRINGS
+from data_collection.schema import COLUMNS, JSON_STRINGS
 from envs.errors import UsageError
 
-INFOS = ("state", "scene_obs", "segmentation", "body_pose")
+FIELDS = ("rgb", "depth", "proprio", "action", "reward")
+"""The columns that Minari has a field for."""
 REPEATED = ("camera", "versions")
 """Attributes that stand elsewhere, or are about the making of single files."""
 
@@ -104,8 +105,9 @@ def episode_buffer(dataset: RGBDDataset, number: int) -> dict[str, Any]:
     """One episode as the fields of Minari's `EpisodeBuffer`."""
     columns = dataset.episode(number)
     steps = len(columns["action"]) - 1
-    camera = dataset.camera
-    infos: dict[str, NDArray[Any]] = {name: columns[name] for name in INFOS if name in columns}
+    camera, last = dataset.camera, np.arange(steps) == steps - 1
+    terminated = dataset.episode_terminated[number]
+    infos = {name: columns[name] for name in COLUMNS if name in columns and name not in FIELDS}
     if "segmentation" in infos:
         infos["segmentation"] = infos["segmentation"].astype(np.int16)  # bytes would become JPEG
     return {
@@ -116,8 +118,8 @@ def episode_buffer(dataset: RGBDDataset, number: int) -> dict[str, Any]:
         },
         "actions": columns["action"][:-1],
         "rewards": columns["reward"][:-1],
-        "terminations": np.zeros(steps, bool),
-        "truncations": np.arange(steps) == steps - 1,
+        "terminations": last & terminated,
+        "truncations": last & ~terminated,
         "infos": infos,
     }
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from data_collection.policies.coloured_noise import coloured_noise
+from envs import rotations
 
 Array = NDArray[np.float64]
 
@@ -106,18 +106,10 @@ def expected_steps(error: Array, scale: Array, speed: float) -> int:
 
 def rotation_between(start: Array, end: Array) -> Array:
     """World-frame rotation vector (3,), radians, that turns the quaternion `start` into `end`, both (4,) wxyz."""
-    inverse, turn, vector = np.empty(4), np.empty(4), np.empty(3)
-    mujoco.mju_negQuat(inverse, start)
-    mujoco.mju_mulQuat(turn, end, inverse)
-    mujoco.mju_quat2Vel(vector, turn, 1.0)
-    return vector
+    return rotations.to_rotvec(rotations.multiply(end, rotations.conjugate(start)))
 
 
 def hand_orientation(yaw: float, tilt: Sequence[float] | Array) -> Array:
     """Orientation (4,) wxyz of the hand; without yaw and tilt it points down and its fingers open along x."""
-    about_z, about_xy, turned, result = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
-    mujoco.mju_axisAngle2Quat(about_z, np.array([0.0, 0.0, 1.0]), yaw)
-    mujoco.mju_euler2Quat(about_xy, np.array([*tilt, 0.0]), "XYZ")
-    mujoco.mju_mulQuat(turned, about_z, POINTING_DOWN)
-    mujoco.mju_mulQuat(result, about_xy, turned)
-    return result
+    about_z, about_xy = rotations.from_euler(np.array([[0.0, 0.0, yaw], [*tilt, 0.0]]))
+    return rotations.multiply(about_xy, rotations.multiply(about_z, POINTING_DOWN))

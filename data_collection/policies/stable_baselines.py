@@ -88,11 +88,12 @@ def _load_once(name: str) -> tuple[Path, Any]:
     return Path(path), load_model(Path(path))
 
 
-def load_model(path: Path, **changes: Any) -> Any:
-    """The Stable-Baselines3 model of a zip file, on the CPU.
+def load_model(path: Path, device: str = "cpu", **changes: Any) -> Any:
+    """The Stable-Baselines3 model of a zip file.
 
     Args:
         path: of the file.
+        device: PyTorch's name of it, or "auto".
         changes: passed on to the algorithm's `load`; without any, what only training needs is left out.
 
     Raises:
@@ -103,7 +104,7 @@ def load_model(path: Path, **changes: Any) -> Any:
             module = json.loads(file.read("data"))["policy_class"]["__module__"]
         package, algorithm = ALGORITHMS[module]
         loader = getattr(importlib.import_module(package), algorithm)
-        return loader.load(path, device="cpu", **(changes or {"custom_objects": NOT_NEEDED}))
+        return loader.load(path, device=device, **(changes or {"custom_objects": NOT_NEEDED}))
     except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError, ImportError) as error:
         known = ", ".join(name for _, name in ALGORITHMS.values())
         raise UsageError(f"{path} is no policy that can be loaded here ({error!r}); give a zip of {known}") from error

@@ -28,7 +28,8 @@ class DexHandEnv(RGBDEnv):
     and as it shall be. Action: (20,) in [-1, 1], targets of the actuated joints, -1 and 1 the ends of their ranges.
 
     `info`: `is_success`, `is_dropped`, `rotation_error` (rad), `position_error` (m), `joint_delta` (24,) how far each
-    joint went in this step (rad), `goals_reached`, and `scene_obs` (14,): the pose of the cube, then of the goal.
+    joint went in this step (rad), `goals_reached`, and `scene_obs` (14,): the pose of the cube, then of the goal. Where
+    a new goal follows one that is reached, `info` is about the old one, the observation and the state have the new one.
 
     Args:
         goal_angle: the largest angle between the cube at the start and its goal, degrees; 180 for any goal.
@@ -109,6 +110,7 @@ class DexHandEnv(RGBDEnv):
         reward = float(self.compute_reward(self.cube_pose.astype(np.float32), self.goal.astype(np.float32), info))
         if info["is_success"] and self.new_goals:  # the reward is for the old one, the observation shows the new one
             self._goals_reached += 1
+            info["goals_reached"] = self._goals_reached
             self._draw_goal()
         return self.observation(), reward, info["is_dropped"], False, info
 

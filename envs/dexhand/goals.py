@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from envs import rotations
+
 Array = NDArray[np.float64]
 
 HOME = np.array([1.0, 0.88, 0.16])  # m, where the cube lies in the hand; the position of every goal
@@ -71,21 +73,7 @@ def random_turn(max_angle: float, rng: np.random.Generator) -> Array:
     return np.append(np.cos(angle / 2), np.sin(angle / 2) * axis / np.linalg.norm(axis))
 
 
-def product(left: ArrayLike, right: ArrayLike) -> Array:
-    """The quaternion (..., 4) of the rotation `right` followed by `left`, both (..., 4)."""
-    (a, b, c, d), (e, f, g, h) = np.moveaxis(np.asarray(left), -1, 0), np.moveaxis(np.asarray(right), -1, 0)
-    return np.stack(
-        [
-            a * e - b * f - c * g - d * h,
-            a * f + b * e + c * h - d * g,
-            a * g - b * h + c * e + d * f,
-            a * h + b * g - c * f + d * e,
-        ],
-        axis=-1,
-    )
-
-
-def draw_goal(cube_orientation: ArrayLike, max_angle: float, rng: np.random.Generator) -> Array:
+def draw_goal(cube_orientation: Array, max_angle: float, rng: np.random.Generator) -> Array:
     """A goal pose (7,): the cube's orientation (4,) turned by at most `max_angle` radians, and `HOME`."""
-    orientation = product(random_turn(max_angle, rng), cube_orientation)
+    orientation = rotations.multiply(random_turn(max_angle, rng), cube_orientation)
     return np.concatenate([HOME, orientation / np.linalg.norm(orientation)])

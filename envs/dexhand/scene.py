@@ -6,8 +6,8 @@ import importlib.util
 from pathlib import Path
 
 import mujoco
-import numpy as np
 
+from envs import viewpoints
 from envs.errors import UsageError
 from envs.meshes import light_mesh
 
@@ -118,14 +118,5 @@ def _set_looks(spec: mujoco.MjSpec) -> None:
         castshadow=False,
     )
     for name, view in (("static", STATIC_CAMERA), ("side", SIDE_CAMERA)):
-        eye, quat = _look_at(view["distance"], np.radians(view["elevation"]), np.radians(view["azimuth"]))
-        spec.worldbody.add_camera(name=name, pos=eye, quat=quat, fovy=view["fovy"])
-
-
-def _look_at(distance: float, elevation: float, azimuth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Place (3,) and orientation (4,) of a MuJoCo camera (x right, y up, looking along -z) that looks at the palm."""
-    back = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, np.column_stack([right, np.cross(back, right), back]).ravel())
-    return np.array(PALM) + distance * back, quat
+        eye, axes = viewpoints.orbit(PALM, view["distance"], view["elevation"], view["azimuth"])
+        spec.worldbody.add_camera(name=name, pos=eye, quat=viewpoints.quaternion(axes), fovy=view["fovy"])

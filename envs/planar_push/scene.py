@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from envs import viewpoints
 from envs.planar_push.wardrobe import CONTACTS, VISIBLE, add_object
 
 CONTROL_RATE, SUBSTEPS = 12, 20  # Hz, physics steps in a control step; a push of Omnipush has 12 frames and takes 1 s
@@ -79,8 +80,8 @@ def _add_surroundings(root: Any) -> None:
         specular=[0] * 3,
     )  # fmt: skip
     for name, view in (("static", STATIC_CAMERA), ("side", SIDE_CAMERA)):
-        eye, axes = _look_at(view["distance"], np.radians(view["elevation"]), np.radians(view["azimuth"]))
-        root.worldbody.add("camera", name=name, pos=eye, xyaxes=axes, fovy=view["fovy"])
+        eye, axes = viewpoints.orbit(np.zeros(3), view["distance"], view["elevation"], view["azimuth"])
+        root.worldbody.add("camera", name=name, pos=eye, xyaxes=axes[:, :2].T.ravel(), fovy=view["fovy"])
 
 
 def _add_tip(root: Any) -> None:
@@ -118,10 +119,3 @@ def _add_tip(root: Any) -> None:
         )
     for name in ("tip_x", "tip_y"):
         root.actuator.add("velocity", name=f"damper_{name}", joint=name, kv=TIP_DAMPING)
-
-
-def _look_at(distance: float, elevation: float, azimuth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Place (3,) and image axes, right then up (6,), of a camera that looks at the middle of the table from outside."""
-    back = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    return distance * back, np.concatenate([right, np.cross(back, right)])

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from envs import rotations
 from envs.actions import clip_action
-from envs.tabletop import rotations
 from envs.tabletop.robot import FINGER_TRAVEL
 from envs.tabletop.scene import CONTROL_RATE
 

@@ -9,9 +9,10 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from envs import rotations
 from envs.base import RENDER_MODES, RGBDEnv
 from envs.errors import UsageError
-from envs.tabletop import control, placement, rotations, table
+from envs.tabletop import control, placement, table
 from envs.tabletop.control import Pose
 from envs.tabletop.kinematics import ArmKinematics
 from envs.tabletop.layouts import layout

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
-from envs.tabletop import rotations
+from envs import rotations
 from envs.tabletop.control import Pose
 from envs.tabletop.robot import ARM_JOINTS, REST_ARM
 

@@ -6,8 +6,9 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from envs import rotations
 from envs.errors import UsageError
-from envs.tabletop import rotations, table
+from envs.tabletop import table
 from envs.tabletop.control import WORKSPACE_HIGH, WORKSPACE_LOW, Pose
 from envs.tabletop.kinematics import ArmKinematics
 from envs.tabletop.layouts import Layout

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import mujoco
-import numpy as np
+from typing import Any
 
+import mujoco
+
+from envs import viewpoints
 from envs.tabletop import robot, table
 from envs.tabletop.layouts import layout
 from envs.tabletop.textures import add_textured_material, add_wood
@@ -12,13 +14,18 @@ from envs.tabletop.textures import add_textured_material, add_wood
 CONTROL_RATE, SUBSTEPS = 30, 8  # Hz, physics steps in a control step; CALVIN's
 TIMESTEP = 1 / (CONTROL_RATE * SUBSTEPS)  # s
 
-STATIC_CAMERA = {
+STATIC_CAMERA: dict[str, Any] = {
     "fovy": 10.0,
     "eye": (2.871, -2.167, 2.555),
     "target": (-0.026, -0.030, 0.392),
     "up": (0.404, 0.226, 0.886),  # CALVIN's; not upright, its pictures lean
 }
-SIDE_CAMERA = {"fovy": 24.0, "eye": (-1.05, -2.35, 1.75), "target": (-0.04, -0.12, 0.42), "up": (0.0, 0.0, 1.0)}
+SIDE_CAMERA: dict[str, Any] = {
+    "fovy": 24.0,
+    "eye": (-1.05, -2.35, 1.75),
+    "target": (-0.04, -0.12, 0.42),
+    "up": (0.0, 0.0, 1.0),
+}
 STATIC_DEPTH_RANGE = (3.4, 6.3)  # m; CALVIN's 3.7 would cut off a forearm that is stretched towards the camera
 SIDE_DEPTH_RANGE = (1.6, 6.0)  # m
 
@@ -88,15 +95,5 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
         castshadow=False,
     )
     for name, view in (("static", STATIC_CAMERA), ("side", SIDE_CAMERA)):
-        spec.worldbody.add_camera(name=name, pos=view["eye"], fovy=view["fovy"], quat=_look_at(**view))
-
-
-def _look_at(eye, target, up, fovy) -> np.ndarray:
-    """Orientation (4,) of a MuJoCo camera (x right, y up, looking along -z)."""
-    back = np.subtract(eye, target)
-    back /= np.linalg.norm(back)
-    right = np.cross(up, back)
-    right /= np.linalg.norm(right)
-    quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, np.column_stack([right, np.cross(back, right), back]).ravel())
-    return quat
+        axes = viewpoints.look_at(view["eye"], view["target"], view["up"])
+        spec.worldbody.add_camera(name=name, pos=view["eye"], fovy=view["fovy"], quat=viewpoints.quaternion(axes))

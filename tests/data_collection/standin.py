@@ -92,6 +92,22 @@ def reset_seed(seed: int, episode: int) -> int:
 gymnasium.register("standin/Square-v0", entry_point=StandIn)
 
 
+class Ending(StandIn):
+    """Terminates or truncates every episode at its third step."""
+
+    def __init__(self, image_size: int = 16, terminates: bool = True) -> None:
+        super().__init__(image_size)
+        self.terminates = terminates
+
+    def step(self, action):
+        obs, reward, _, _, info = super().step(action)
+        over = self.steps == 3
+        return obs, reward, over and self.terminates, over and not self.terminates, info
+
+
+gymnasium.register("standin/Ending-v0", entry_point=Ending)
+
+
 class Blind(gymnasium.Env):
     """Neither camera nor images."""
 

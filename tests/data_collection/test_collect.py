@@ -13,7 +13,9 @@ from standin import FAR, NEAR, StandIn, reset_seed
 
 from data_collection.collect import Config, main
 from data_collection.dataset import RGBDDataset
+from data_collection.episodes import EpisodeMaker
 from data_collection.files import locked
+from data_collection.manifest import Manifest
 from data_collection.policies.random import RandomPolicy
 from data_collection.repair import find_damage
 from data_collection.rollout import collect_episode
@@ -51,8 +53,8 @@ def test_episodes_and_runs_differ(collected):
     dataset = RGBDDataset(collected)
     actions = [dataset.episode(number)["action"] for number in range(4)]
     env = StandIn()
-    actions.append(collect_episode(env, RandomPolicy(), 8, seed=0, episode=0)["action"])
-    actions.append(collect_episode(env, RandomPolicy(), 8, seed=1, episode=0)["action"])
+    actions.append(collect_episode(env, RandomPolicy(), 8, seed=0, episode=0)[0]["action"])
+    actions.append(collect_episode(env, RandomPolicy(), 8, seed=1, episode=0)[0]["action"])
     for i in range(len(actions)):
         for j in range(i):
             assert not np.array_equal(actions[i], actions[j])
@@ -72,6 +74,11 @@ def test_same_command_goes_on_and_a_larger_number_extends(tmp_path):
         shown = "env_kwargs" if field == "image_size" else field
         with pytest.raises(UsageError, match=rf"was collected with {shown} = .*{value}.*choose another --out"):
             main(Config(**{**arguments(tmp_path, episodes=3), field: value}))
+
+
+def test_the_episodes_that_are_there_are_counted(tmp_path):
+    assert "2 episodes in" in call("collect-rollouts", options(tmp_path, episodes=2))[1]
+    assert "2 episodes in" in call("collect-rollouts", options(tmp_path, episodes=1))[1]
 
 
 def arguments(out, **changed):
@@ -184,6 +191,14 @@ def test_bad_options_are_one_line(tmp_path, changed, words):
     assert_one_line_error(call("collect-rollouts", options(tmp_path / "data", **changed)), *words)
 
 
+def test_a_place_below_a_file_is_one_line(tmp_path):
+    file = tmp_path / "file"
+    file.touch()
+    assert_one_line_error(
+        call("collect-rollouts", options(file / "data")), f"cannot read or write {file}", "another place"
+    )
+
+
 def test_environment_that_does_not_observe_depth(tmp_path):
     with pytest.raises(UsageError, match="has no attribute 'camera'"):
         main(Config(**arguments(tmp_path, env="standin:standin/Blind-v0")))
@@ -201,6 +216,20 @@ def test_damaged_shard_stops_resuming(collected, tmp_path):
     (tmp_path / "shard-00000.h5").write_bytes(b"")
     result = call("collect-rollouts", options(tmp_path, episodes=2))
     assert_one_line_error(result, "shard-00000.h5 is damaged", "inspect-dataset", "--repair")
+
+
+@pytest.mark.parametrize("terminates", [True, False])
+def test_the_environment_may_end_an_episode_and_the_dataset_says_how(tmp_path, terminates):
+    what = {"image_size": 16, "terminates": terminates}
+    manifest = Manifest("standin:standin/Ending-v0", what, "noise", seed=0, steps=8, ground_truth=False, episodes=1)
+    EpisodeMaker(manifest).write(0, tmp_path / "shard-00000.h5")
+    dataset = RGBDDataset(tmp_path)
+    assert dataset.episode_lengths.tolist() == [4]
+    assert dataset.episode_terminated.tolist() == [terminates]
+
+
+def test_episodes_whose_steps_are_up_have_not_terminated(collected):
+    assert not RGBDDataset(collected).episode_terminated.any()
 
 
 class _NanPolicy(RandomPolicy):

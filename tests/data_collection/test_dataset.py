@@ -194,6 +194,20 @@ def test_shards_of_different_datasets(folder, episodes):
         RGBDDataset(folder)
 
 
+def test_how_episodes_ended_is_kept_and_is_no_part_of_the_content(folder, episodes):
+    before = RGBDDataset(folder)
+    assert before.episode_terminated.tolist() == [False] * 3  # without the table none did
+    write_shard(folder / "shard-00000.h5", episodes[:2], ATTRS, [0, 1], [False, True])
+    after = RGBDDataset(folder)
+    assert after.episode_terminated.tolist() == [False, True, False]
+    assert after.columns == before.columns and after.content_hash == before.content_hash
+    with h5py.File(folder / "shard-00000.h5", "a") as file:
+        del file["ep_terminated"]
+        file["ep_terminated"] = np.zeros(3, np.uint8)
+    with pytest.raises(DamagedShard, match=r"ep_terminated is \(3,\), for 2 episodes"):
+        RGBDDataset(folder)
+
+
 def test_writer_refuses_what_the_schema_does_not_have(tmp_path, episodes):
     path = tmp_path / "shard-00000.h5"
     for spoil in (

@@ -15,10 +15,13 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data")
     rng = np.random.default_rng(0)
     attrs = {**ATTRS, "env_id": "calvin/D"}
-    write_shard(folder / "shard-00000.h5", [make_episode(rng, 5, ground_truth=True)], attrs, [0])
-    write_shard(
-        folder / "shard-00001.h5", [make_episode(rng, rows, ground_truth=True) for rows in (3, 8)], attrs, [1, 2]
-    )
+
+    def episode(rows):
+        turned = rng.normal(size=(rows, 3)).astype(np.float32)
+        return {**make_episode(rng, rows, ground_truth=True), "joint_delta": turned}
+
+    write_shard(folder / "shard-00000.h5", [episode(5)], attrs, [0])
+    write_shard(folder / "shard-00001.h5", [episode(rows) for rows in (3, 8)], attrs, [1, 2], [True, False])
     return folder
 
 
@@ -42,8 +45,12 @@ def test_minari_opens_the_export(folder, tmp_path, monkeypatch):
         np.testing.assert_array_equal(episode.actions, expected["action"][:-1])
         np.testing.assert_array_equal(episode.rewards, expected["reward"][:-1])
         np.testing.assert_array_equal(episode.infos["segmentation"], expected["segmentation"])
+        assert set(episode.infos) == {"state", "joint_delta", "segmentation", "body_pose"}
         np.testing.assert_array_equal(episode.infos["state"], expected["state"])
-        assert episode.truncations.tolist() == [False] * (len(episode) - 1) + [True] and not episode.terminations.any()
+        np.testing.assert_array_equal(episode.infos["joint_delta"], expected["joint_delta"])
+        terminated = number == 1
+        assert episode.terminations.tolist() == [False] * (len(episode) - 1) + [terminated]
+        assert episode.truncations.tolist() == [False] * (len(episode) - 1) + [not terminated]
         for row in range(len(depth)):
             frame = {name: values[row] for name, values in episode.observations.items()}
             assert theirs.observation_space.contains(frame)
@@ -110,7 +117,7 @@ def test_one_file_for_stable_worldmodel(folder, tmp_path):
     code, out, err = call("export-dataset", [folder, "--to", "stable-worldmodel", "--out", path])
     assert code == 0 and str(path) in out, err
     dataset, reader = RGBDDataset(folder), TheirReader(path, 2, 2)
-    assert reader.keys == ["action", "depth", "pixels", "proprio", "reward", "state"]
+    assert reader.keys == ["action", "depth", "joint_delta", "pixels", "proprio", "reward", "state"]
     assert [len(clips) for clips in ([c for c in reader.clips if c[0] == e] for e in range(3))] == [2, 0, 5]
     clip, episode = reader[-1], dataset.episode(2)
     np.testing.assert_array_equal(clip["pixels"], episode["rgb"][4:8:2])

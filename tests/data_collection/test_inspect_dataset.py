@@ -79,11 +79,11 @@ def test_intact_episodes_of_a_damaged_shard_are_kept(tmp_path):
     rng = np.random.default_rng(0)
     episodes = [make_episode(rng, 1000), make_episode(rng, 1000)]  # longer than a chunk
     path = tmp_path / "shard-00000.h5"
-    write_shard(path, episodes, ATTRS, [4, 5])
+    write_shard(path, episodes, ATTRS, [4, 5], [False, True])
     flip_a_byte_of(path, "rgb")
     assert repair(tmp_path) == ["dropped episode 4 of shard-00000.h5: checksum differs; kept as damaged/shard-00000.h5"]
     dataset = RGBDDataset(tmp_path)
-    assert dataset.episode_indices.tolist() == [5]
+    assert dataset.episode_indices.tolist() == [5] and dataset.episode_terminated.tolist() == [True]
     np.testing.assert_array_equal(episode_hash(dataset.episode(0)), episode_hash(episodes[1]))
 
 

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import json
+import dataclasses
 
 import imageio.v2 as imageio
 import numpy as np
 import pytest
 from commands import call
 
-from data_collection import goal_scores, hand_pictures, train_policy
+from data_collection import hand_pictures, train_policy
+from data_collection.collect import Config
 from data_collection.dataset import RGBDDataset
-from data_collection.environments import resolve_env, usual_policy
+from data_collection.environments import resolve_env, usual_policy, usual_steps
 from data_collection.policies import make_policy
 from data_collection.policies.predictive import PredictivePolicy, Settings
 from data_collection.policies.predictive_cost import Weights, step_costs
 from data_collection.policies.stable_baselines import load_model, policy_name
 from data_collection.rollout import collect_episode
+from envs import rotations
 from envs.dexhand import DexHandEnv, goals
 from envs.dexhand.simulate import BatchSimulator
 from envs.errors import UsageError
@@ -124,7 +126,7 @@ def test_costs_name_what_is_bad(env):
         return step_costs(Weights(), paths, action, pose if goal is None else goal)[0, 0]
 
     turned = pose.copy()
-    turned[3:] = goals.product([np.cos(0.25), 0, 0, np.sin(0.25)], pose[3:])
+    turned[3:] = rotations.multiply(np.array([np.cos(0.25), 0, 0, np.sin(0.25)]), pose[3:])
     assert cost() == 0
     assert cost(turned) == pytest.approx(0.5)
     assert cost(x=0.03) == pytest.approx(Weights().place * 0.01)
@@ -147,16 +149,22 @@ def test_bad_input_is_named():
 # --- Collecting ----------------------------------------------------------------------------------------------------
 
 
-def test_the_usual_policy_and_environment():
+def test_what_is_usual_in_an_environment(tmp_path):
     env_id, kwargs = resolve_env("dexhand", None)
     assert env_id == "t3vip/DexHand-v0"
     assert kwargs == {"new_goals": True}
     assert usual_policy("dexhand") == usual_policy(env_id) == "predictive"
+    assert usual_steps("dexhand") == usual_steps("envs:t3vip/DexHand-v0") == 100
+    assert usual_steps("tabletop") == usual_steps("planar-push") == usual_steps("other/Env-v0") == 240
+    config = Config(tmp_path, env="dexhand")
+    assert config.manifest().steps == 100
+    assert dataclasses.replace(config, steps=240).manifest().steps == 240
 
 
 def test_commands_and_joint_deltas_are_recorded():
     env = DexHandEnv(image_size=16, supersample=1)
-    columns = collect_episode(env, PredictivePolicy(Settings(stage=2, ahead=1, samples=4)), 5, 0, 0, ground_truth=True)
+    policy = PredictivePolicy(Settings(stage=2, ahead=1, samples=4))
+    columns, _ = collect_episode(env, policy, 5, 0, 0, ground_truth=True)
     assert columns["action"].shape == (6, 20)
     assert columns["joint_delta"].shape == (6, 24)
     assert not columns["joint_delta"][-1].any()
@@ -199,13 +207,52 @@ def test_a_trained_policy_acts_in_the_collector(trained, tmp_path):
         hand_pictures.main(hand_pictures.Config(out, tmp_path, episode=1))
 
 
+def copy_of(trained, folder):
+    for path in (trained, trained.with_suffix(".json")):
+        (folder / path.name).write_bytes(path.read_bytes())
+    return folder / trained.name
+
+
 def test_training_goes_on_where_it_stopped(trained, tmp_path):
-    path = tmp_path / "hand.zip"
-    path.write_bytes(trained.read_bytes())
+    path = copy_of(trained, tmp_path)
     train_policy.main(train_policy.Config(path, steps=112, batch=8, buffer=500, trials=0))
     assert load_model(path).num_timesteps == 112
     with pytest.raises(UsageError, match="is not the policy it was"):
         make_policy(policy_name(trained).replace(str(trained), str(path)))
+
+
+def test_a_part_of_a_run_has_its_own_episodes_and_any_device(trained, tmp_path, monkeypatch):
+    devices = []
+
+    def load(path, device, **changes):
+        devices.append(device)
+        return load_model(path, device, **changes)
+
+    monkeypatch.setattr(train_policy, "load_model", load)
+    config = train_policy.Config(copy_of(trained, tmp_path), steps=112, batch=8, buffer=500)
+    hand = train_policy._make_env(config)
+    new = train_policy._model(dataclasses.replace(config, out=tmp_path / "new.zip"), hand)
+    start, action = new.env.reset()["observation"], new.action_space.sample()
+    resumed = train_policy._model(config, hand)
+    assert not np.array_equal(resumed.env.reset()["observation"], start)
+    assert not np.array_equal(resumed.action_space.sample(), action)
+    assert devices == ["auto"]
+    hand.close()
+
+
+def test_training_with_other_options_is_refused(trained, tmp_path):
+    path = copy_of(trained, tmp_path)
+    config = train_policy.Config(path, steps=112, batch=8, buffer=500, trials=0)
+    for name, value in (("algorithm", "td3"), ("reward", "dense"), ("goal_angle", 90.0), ("learning_rate", 0.1)):
+        with pytest.raises(UsageError, match=rf"was trained with {name} = .*, not {value!r}; .* another --out"):
+            train_policy.main(dataclasses.replace(config, **{name: value}))
+    path.with_suffix(".json").write_text("no options")
+    with pytest.raises(UsageError, match=r"hand\.json does not hold the options"):
+        train_policy.main(config)
+    path.with_suffix(".json").unlink()
+    with pytest.raises(UsageError, match=r"hand\.zip has no hand\.json beside it"):
+        train_policy.main(config)
+    assert path.read_bytes() == trained.read_bytes()
 
 
 def test_bad_policy_files_are_named(trained, tmp_path, env):
@@ -230,27 +277,3 @@ def test_bad_policy_files_are_named(trained, tmp_path, env):
     code, _, err = call("collect-rollouts", ["--out", str(tmp_path / "d"), "--policy", "dance"])
     assert code == 2
     assert "'dance'" in err
-
-
-# --- Scores --------------------------------------------------------------------------------------------------------
-
-
-def test_scores_compare_policies_from_the_same_starts(tmp_path, capsys):
-    tasks = [
-        {"policy": name, "episode": n, "steps": 4, "goal_angle": 90.0, "seed": 0}
-        for name in ("random", "hold")
-        for n in range(2)
-    ]
-    rows = [goal_scores.play(task) for task in tasks]
-    for n in range(2):
-        assert rows[n]["errors"][0] == rows[2 + n]["errors"][0]
-    assert abs(rows[2]["errors"][-1] - rows[2]["errors"][0]) < 0.2  # nothing moves, nothing turns
-    assert len(rows[0]["errors"]) == 5
-    out = tmp_path / "goals.jsonl"
-    out.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    before = out.read_text()
-    goal_scores.main(goal_scores.Config(out, ("random", "hold"), episodes=2, steps=4))  # all is there already
-    assert out.read_text() == before
-    lines = capsys.readouterr().out.splitlines()
-    start = round(np.degrees(np.median([row["errors"][0] for row in rows[:2]])))
-    assert lines[2].startswith(f"| random | 2 | {start} |")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -47,3 +48,52 @@ def test_another_broken_pipe_keeps_its_traceback():
 
     with pytest.raises(BrokenPipeError):
         run(Config, main, [])
+
+
+def test_paragraphs_of_the_help_begin_at_the_margin(capsys):
+    @dataclass
+    class Config:
+        """One thing.
+
+        And another.
+        """
+
+    with pytest.raises(SystemExit):
+        run(Config, lambda config: None, ["--help"])
+    assert "\nOne thing.\n\nAnd another.\n" in capsys.readouterr().out
+
+
+@dataclass
+class Nothing:
+    """No options."""
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (PermissionError(errno.EACCES, "Permission denied", "a/b"), "cannot read or write a/b (Permission denied); "),
+        (NotADirectoryError(errno.ENOTDIR, "Not a directory", "f/x"), "cannot read or write f/x (Not a directory); "),
+        (FileExistsError(errno.EEXIST, "File exists", "f"), "cannot read or write f (File exists); "),
+        (OSError(errno.EROFS, "Read-only file system", "a.h5"), "cannot write a.h5 (Read-only file system); "),
+        (OSError(errno.ENOSPC, "No space left on device"), "cannot write a file (No space left on device); "),
+    ],
+)
+def test_places_that_cannot_be_used_are_one_line(error, said, capsys):
+    def main(config: Nothing) -> None:
+        raise error
+
+    with pytest.raises(SystemExit) as stop:
+        run(Nothing, main, [])
+    err = capsys.readouterr().err
+    assert stop.value.code == 2 and err.startswith(f"error: {said}") and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "error", [PermissionError(errno.EPERM, "no such right"), FileNotFoundError(errno.ENOENT, "no", "a")]
+)
+def test_errors_that_are_bugs_keep_their_traceback(error):
+    def main(config: Nothing) -> None:
+        raise error
+
+    with pytest.raises(type(error)):
+        run(Nothing, main, [])

@@ -11,6 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from scipy.spatial.transform import Rotation
 
 import envs  # noqa: F401  (registers)
+from envs import rotations
 from envs.dexhand import DexHandEnv, control, goals
 from envs.dexhand.simulate import BatchSimulator
 from envs.errors import UsageError
@@ -132,6 +133,9 @@ def test_a_new_goal_follows_one_that_is_reached_also_after_restoring():
     observation, reward, _, _, info = env.step(hold)
     assert info["is_success"]
     assert reward == 0
+    assert info["goals_reached"] == 1
+    np.testing.assert_array_equal(info["scene_obs"][7:10], goals.HOME)
+    np.testing.assert_allclose(goals.rotation_distance(info["scene_obs"][10:], info["scene_obs"][3:7]), 0, atol=0.2)
     assert goals.rotation_distance(observation["desired_goal"][3:], observation["achieved_goal"][3:]) > 0.2
     env.set_state(state)
     np.testing.assert_array_equal(env.step(hold)[0]["desired_goal"], observation["desired_goal"])
@@ -189,7 +193,7 @@ def test_distances_and_products_of_rotations():
     a, b = (np.roll(r.as_quat(), 1, axis=1) * rng.choice([-1, 1], (50, 1)) for r in (one, other))
     np.testing.assert_allclose(goals.rotation_distance(a, b), (one * other.inv()).magnitude(), atol=1e-9)
     both = np.roll((one * other).as_quat(), 1, axis=1)
-    np.testing.assert_allclose(goals.rotation_distance(goals.product(a, b), both), 0, atol=1e-7)
+    np.testing.assert_allclose(goals.rotation_distance(rotations.multiply(a, b), both), 0, atol=1e-7)
 
 
 def test_batch_simulation_is_what_the_environment_does(blind):

@@ -10,8 +10,9 @@ import stable_baselines3.common.env_checker as sb3
 from gymnasium.utils.env_checker import check_env
 
 import envs  # noqa: F401  (registers)
+from envs import rotations
 from envs.errors import UsageError
-from envs.tabletop import TabletopEnv, control, rotations, table
+from envs.tabletop import TabletopEnv, control, table
 from envs.tabletop.env import FIXTURES
 from envs.tabletop.placement import GRIPPER_DOWN
 from envs.tabletop.simulate import BatchSimulator
