@@ -130,12 +130,12 @@ def _begin(manifest: Manifest, folder: Path) -> None:
     if before is None:
         if shards:
             raise UsageError(f"{folder} has shards but no {MANIFEST_NAME}; choose another --out")
-    else:
+    elif shards:  # without any, as after options that did not work, there is nothing to go on with
         manifest.check_continues(before, folder)
     makers = [read_shard(shard).attrs["versions"] for shard in shards]
     if any(maker != versions() for maker in makers):
         print(f"warning: {folder} holds episodes made by other versions of the programs", file=sys.stderr)
-    if before is None or before.episodes < manifest.episodes:
+    if before is None or not shards or before.episodes < manifest.episodes:
         manifest.save(folder)
 
 

@@ -69,11 +69,11 @@ def resolve_env(name: str, scene: str | None) -> tuple[str, dict[str, Any]]:
 
 
 def usual_policy(name: str) -> str:
-    """Who acts in an environment, by its short name or Gymnasium id, unless told otherwise."""
+    """Who acts in an environment, by its short name or Gymnasium id, unless told otherwise; noise in unknown ones."""
     if name in KNOWN_ENVS:
         return KNOWN_ENVS[name].policy
     families = {known.env_id.partition("{")[0]: known.policy for known in KNOWN_ENVS.values()}
-    return next((policy for family, policy in families.items() if family in name), "play")
+    return next((policy for family, policy in families.items() if family in name), "noise")
 
 
 def make_env(env_id: str, env_kwargs: dict[str, Any], ground_truth: bool) -> gymnasium.Env:

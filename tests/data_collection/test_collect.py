@@ -184,6 +184,15 @@ def test_bad_options_are_one_line(tmp_path, changed, words):
     assert_one_line_error(call("collect-rollouts", options(tmp_path / "data", **changed)), *words)
 
 
+def test_policy_of_another_environment_is_told_at_once_and_leaves_the_folder_free(tmp_path):
+    result = call("collect-rollouts", options(tmp_path, policy="play"))
+    assert_one_line_error(result, "policy 'play' cannot act in StandIn", "--env tabletop")
+    assert "lost episode" not in result[2] and not list(tmp_path.glob("*.h5"))
+    code, _, err = call("collect-rollouts", options(tmp_path, episodes=1))
+    assert code == 0, err
+    assert json.loads((tmp_path / "dataset.json").read_text())["policy"] == "noise"
+
+
 def test_environment_that_does_not_observe_depth(tmp_path):
     with pytest.raises(UsageError, match="has no attribute 'camera'"):
         main(Config(**arguments(tmp_path, env="standin:standin/Blind-v0")))
