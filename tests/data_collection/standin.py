@@ -21,6 +21,7 @@ NEAR, FAR = 1.0, 3.0
 class StandIn(gymnasium.Env):
     ACTION_AGGREGATION = ("sum", "sum", "last")
     ACTION_SCALE = (0.1, 0.1, 1.0)
+    SIGNS = (2,)
     control_rate = 10
     body_names = ("world", "square")
     hand_body_ids = (1,)
