@@ -132,8 +132,9 @@ def _begin(manifest: Manifest, folder: Path) -> None:
             raise UsageError(f"{folder} has shards but no {MANIFEST_NAME}; choose another --out")
     elif shards:  # without any, as after options that did not work, there is nothing to go on with
         manifest.check_continues(before, folder)
+    now = versions()  # once: it reads all of the source
     makers = [read_shard(shard).attrs["versions"] for shard in shards]
-    if any(maker != versions() for maker in makers):
+    if any(maker != now for maker in makers):
         print(f"warning: {folder} holds episodes made by other versions of the programs", file=sys.stderr)
     if before is None or not shards or before.episodes < manifest.episodes:
         manifest.save(folder)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -13,6 +14,7 @@ from standin import FAR, NEAR, StandIn, reset_seed
 
 from data_collection.collect import Config, main
 from data_collection.dataset import RGBDDataset
+from data_collection.environments import versions
 from data_collection.files import locked
 from data_collection.policies.random import RandomPolicy
 from data_collection.repair import find_damage
@@ -203,6 +205,13 @@ def test_going_on_with_other_programs_is_told(tmp_path, monkeypatch):
     assert "other versions" not in call("collect-rollouts", options(tmp_path, episodes=1))[2]
     monkeypatch.setattr("data_collection.collect.versions", lambda: {"source": "changed"})
     assert "made by other versions" in call("collect-rollouts", options(tmp_path, episodes=1))[2]
+
+
+def test_going_on_reads_the_source_once_however_many_episodes_there_are(collected, tmp_path, monkeypatch):
+    folder, calls = shutil.copytree(collected, tmp_path / "data"), []
+    monkeypatch.setattr("data_collection.collect.versions", lambda: calls.append(1) or versions())
+    main(Config(**arguments(folder, ground_truth=True)))
+    assert len(calls) == 1
 
 
 def test_damaged_shard_stops_resuming(collected, tmp_path):
