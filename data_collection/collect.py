@@ -32,8 +32,9 @@ class Config:
     out: Path
     """Folder of the dataset; made if it is not there."""
     env: str = "tabletop"
-    """Environment: a short name (tabletop, planar-push, dexhand), or any Gymnasium id whose environment has a
-    `camera`."""
+    """Environment: a short name (tabletop, planar-push, dexhand), or any Gymnasium id. Another environment must observe
+    rgb, depth and proprio, and have camera, get_state, ACTION_AGGREGATION, ACTION_SCALE and control_rate, as
+    docs/data.md says."""
     scene: str | None = None
     """Scene or split, where the environment has several (tabletop: A, B, C, D, usually C; planar-push: train,
     validation, test, all, usually train)."""

@@ -14,12 +14,11 @@ import numpy as np
 
 import data_collection
 import envs  # registers the environments
+from data_collection.requirements import check_env
 from envs.errors import UsageError
 from envs.gl import gl_renderer
 
 PACKAGES = ("t3vip", "mujoco", "robosuite", "gymnasium", "numpy", "h5py")
-NEEDED = ("camera", "get_state", "ACTION_AGGREGATION", "ACTION_SCALE", "control_rate")
-NEEDED_FOR_GROUND_TRUTH = ("segmentation", "body_poses", "body_names", "hand_body_ids")
 
 
 @dataclass(frozen=True)
@@ -80,18 +79,13 @@ def make_env(env_id: str, env_kwargs: dict[str, Any], ground_truth: bool) -> gym
     """Make an environment to collect from: no time limit, checked for what a dataset needs.
 
     Raises:
-        UsageError: it cannot be made, or lacks something.
+        UsageError: it cannot be made, lacks something, or observes what a dataset does not store.
     """
     try:
         env = gymnasium.make(env_id, max_episode_steps=-1, disable_env_checker=True, **env_kwargs)
     except (gymnasium.error.Error, ModuleNotFoundError, TypeError) as error:
         raise UsageError(f"cannot make environment '{env_id}' with {env_kwargs}: {error}; check --env") from error
-    for name in NEEDED + (NEEDED_FOR_GROUND_TRUTH if ground_truth else ()):
-        if not hasattr(env.unwrapped, name):
-            raise UsageError(f"environment '{env_id}' has no attribute '{name}'; it cannot be collected from")
-    for key in ("rgb", "depth", "proprio"):
-        if key not in getattr(env.observation_space, "spaces", {}):
-            raise UsageError(f"environment '{env_id}' does not observe '{key}'; it cannot be collected from")
+    check_env(env, env_id, ground_truth)
     return env
 
 
