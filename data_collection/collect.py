@@ -11,7 +11,7 @@ from types import FrameType
 
 from tqdm import tqdm
 
-from data_collection.environments import resolve_env, usual_policy, versions
+from data_collection.environments import extra_kwargs, known_env, resolve_env, usual_policy, versions
 from data_collection.files import locked, remove_leftovers
 from data_collection.manifest import MANIFEST_NAME, Manifest, read_manifest
 from data_collection.policies import POLICIES
@@ -23,6 +23,8 @@ from data_collection.workers import Collected, WorkerLost, collect_episodes
 from data_collection.writer import shard_path
 from envs.command import run
 from envs.errors import UsageError
+
+IMAGE_SIZE = 64  # pixels
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,9 @@ class Config:
     scene: str | None = None
     """Scene or split, where the environment has several (tabletop: A, B, C, D, usually C; planar-push: train,
     validation, test, all, usually train)."""
+    env_kwargs: str = "{}"
+    """More keyword arguments of the environment, a JSON object: '{"depth_noise": 0.002}' for planar-push,
+    '{"goal_angle": 90}' for dexhand. docs/environments.md lists them."""
     episodes: int = 400
     """Episodes the dataset shall have; a larger number extends it."""
     steps: int = 240
@@ -54,8 +59,9 @@ class Config:
     ray: str | None = None
     """Have them on a Ray cluster: HOST:PORT of its head, auto for the one that runs here, local for one that is started
     here and ends with the command. The episodes are the same; only this process writes them."""
-    image_size: int = 64
-    """Height and width of the images, pixels."""
+    image_size: int | None = None
+    """Height and width of the images, pixels; usually 64. Another environment is given it as `image_size`, and only if
+    the option is."""
     ground_truth: bool = False
     """Also record what a model never sees: body ids of the pixels and poses of the bodies (for scene flow)."""
     episode_timeout: float = 300.0
@@ -63,9 +69,10 @@ class Config:
 
     def __post_init__(self) -> None:
         for name, least in (("episodes", 1), ("steps", 1), ("workers", 1), ("seed", 0), ("image_size", 8)):
-            if getattr(self, name) < least:
+            if getattr(self, name) is not None and getattr(self, name) < least:
                 option = name.replace("_", "-")
                 raise UsageError(f"--{option} is {getattr(self, name)}; give a whole number of at least {least}")
+        extra_kwargs(self.env, self.env_kwargs)
         if not self.episode_timeout > 0:
             raise UsageError(f"--episode-timeout is {self.episode_timeout}; give a positive number of seconds")
         if self.policy is not None and self.policy not in POLICIES and not self.policy.endswith(SUFFIX):
@@ -78,10 +85,13 @@ class Config:
 
     def manifest(self) -> Manifest:
         env_id, env_kwargs = resolve_env(self.env, self.scene)
+        size = self.image_size or (IMAGE_SIZE if known_env(self.env) else None)
+        if size is not None:
+            env_kwargs["image_size"] = size
         policy = self.policy or usual_policy(self.env)
         return Manifest(
             env_id=env_id,
-            env_kwargs={**env_kwargs, "image_size": self.image_size},
+            env_kwargs=env_kwargs | extra_kwargs(self.env, self.env_kwargs),
             policy=policy_name(Path(policy)) if policy.endswith(SUFFIX) else policy,
             seed=self.seed,
             steps=self.steps,

@@ -69,10 +69,41 @@ def resolve_env(name: str, scene: str | None) -> tuple[str, dict[str, Any]]:
 
 def usual_policy(name: str) -> str:
     """Who acts in an environment, by its short name or Gymnasium id, unless told otherwise; noise in unknown ones."""
+    known = known_env(name)
+    return known.policy if known else "noise"
+
+
+def known_env(name: str) -> KnownEnv | None:
+    """The environment of this project that a short name or Gymnasium id means; None if it is another's."""
     if name in KNOWN_ENVS:
-        return KNOWN_ENVS[name].policy
-    families = {known.env_id.partition("{")[0]: known.policy for known in KNOWN_ENVS.values()}
-    return next((policy for family, policy in families.items() if family in name), "noise")
+        return KNOWN_ENVS[name]
+    return next((known for known in KNOWN_ENVS.values() if known.env_id.partition("{")[0] in name), None)
+
+
+def extra_kwargs(name: str, text: str) -> dict[str, Any]:
+    """Keyword arguments that somebody gives an environment, by its short name or Gymnasium id, as JSON.
+
+    Raises:
+        UsageError: no JSON object of finite numbers, or a keyword that other options choose.
+    """
+
+    def refuse(constant: str) -> None:
+        raise ValueError(f"{constant} is no number")
+
+    try:
+        kwargs = json.loads(text, parse_constant=refuse)
+        if not isinstance(kwargs, dict):
+            raise ValueError(f"it is a {type(kwargs).__name__}")
+    except ValueError as error:
+        example = """'{"depth_noise": 0.002}'"""
+        raise UsageError(f"--env-kwargs is '{text}' ({error}); give a JSON object, as {example}") from error
+    chosen = {"image_size": "--image-size"} | ({"scene": "--env and --scene"} if known_env(name) else {})
+    if name in KNOWN_ENVS:
+        chosen[KNOWN_ENVS[name].scene_keyword] = "--scene"
+    for keyword in kwargs:
+        if keyword in chosen:
+            raise UsageError(f"--env-kwargs has '{keyword}', which is for {chosen[keyword]} to say; leave it out")
+    return kwargs
 
 
 def make_env(env_id: str, env_kwargs: dict[str, Any], ground_truth: bool) -> gymnasium.Env:
@@ -84,7 +115,9 @@ def make_env(env_id: str, env_kwargs: dict[str, Any], ground_truth: bool) -> gym
     try:
         env = gymnasium.make(env_id, max_episode_steps=-1, disable_env_checker=True, **env_kwargs)
     except (gymnasium.error.Error, ModuleNotFoundError, TypeError) as error:
-        raise UsageError(f"cannot make environment '{env_id}' with {env_kwargs}: {error}; check --env") from error
+        raise UsageError(
+            f"cannot make environment '{env_id}' with {env_kwargs}: {error}; check --env and --env-kwargs"
+        ) from error
     check_env(env, env_id, ground_truth)
     return env
 

@@ -93,6 +93,20 @@ def reset_seed(seed: int, episode: int) -> int:
 gymnasium.register("standin/Square-v0", entry_point=StandIn)
 
 
+class Paced(StandIn):
+    """Of one size, with a keyword of its own: how far the square goes, against the stand-in's."""
+
+    def __init__(self, pace: float = 1.0) -> None:
+        super().__init__()
+        self.pace = pace
+
+    def step(self, action):
+        return super().step(self.pace * action)
+
+
+gymnasium.register("standin/Paced-v0", entry_point=Paced)
+
+
 class Blind(gymnasium.Env):
     """Neither camera nor images."""
 

@@ -170,9 +170,51 @@ def test_two_collectors_in_one_folder(tmp_path):
         main(Config(**arguments(tmp_path)))
 
 
+def test_an_environments_own_keywords_are_part_of_what_episodes_are(tmp_path):
+    given = {"env": "standin:standin/Paced-v0", "image-size": None, "env-kwargs": '{"pace": 0.5}'}
+    code, _, err = call("collect-rollouts", options(tmp_path, episodes=1, **given))
+    assert code == 0, err
+    dataset = RGBDDataset(tmp_path)
+    assert dataset.attrs["env_kwargs"] == {"pace": 0.5} and dataset.camera.width == 16
+    moves = np.diff(dataset.load("proprio")[:, :2], axis=0)
+    np.testing.assert_allclose(moves, 0.5 * 0.1 * dataset.load("action")[:-1, :2], atol=1e-6)
+    assert call("collect-rollouts", options(tmp_path, episodes=1, **given))[0] == 0
+    result = call("collect-rollouts", options(tmp_path, episodes=1, **{**given, "env-kwargs": '{"pace": 0.1}'}))
+    assert_one_line_error(result, "was collected with env_kwargs = {'pace': 0.5}", "choose another --out")
+
+
+@pytest.mark.parametrize(
+    ("changed", "kwargs"),
+    [
+        ({"env": "tabletop"}, {"image_size": 64}),
+        ({"env": "t3vip/TabletopD-v0", "image_size": 32}, {"image_size": 32}),
+        ({"env": "planar-push"}, {"split": "train", "image_size": 64}),
+        ({"env": "t3vip/PlanarPush-v0", "env_kwargs": '{"split": "all"}'}, {"split": "all", "image_size": 64}),
+        (
+            {"env": "planar-push", "scene": "test", "env_kwargs": '{"depth_noise": 0.002}'},
+            {"split": "test", "image_size": 64, "depth_noise": 0.002},
+        ),
+        ({"env": "dexhand"}, {"new_goals": True, "image_size": 64}),
+        ({"env": "dexhand", "env_kwargs": '{"new_goals": false}'}, {"new_goals": False, "image_size": 64}),
+        ({"env": "my/Env-v0"}, {}),
+        ({"env": "my/Env-v0", "image_size": 64, "env_kwargs": '{"scene": "D"}'}, {"image_size": 64, "scene": "D"}),
+    ],
+)
+def test_keyword_arguments_that_environments_get(tmp_path, changed, kwargs):
+    assert Config(tmp_path, **changed).manifest().env_kwargs == kwargs
+
+
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
+        ({"env-kwargs": "pace=2"}, ("--env-kwargs is 'pace=2'", "JSON object")),
+        ({"env-kwargs": "[1]"}, ("--env-kwargs is '[1]'", "it is a list")),
+        ({"env-kwargs": '{"pace": NaN}'}, ("--env-kwargs", "NaN is no number")),
+        ({"env-kwargs": '{"image_size": 8}'}, ("'image_size'", "--image-size")),
+        ({"env": "tabletop", "env-kwargs": '{"scene": "D"}'}, ("'scene'", "--scene")),
+        ({"env": "t3vip/TabletopC-v0", "env-kwargs": '{"scene": "D"}'}, ("'scene'", "--env")),
+        ({"env": "planar-push", "env-kwargs": '{"split": "test"}'}, ("'split'", "--scene")),
+        ({"env-kwargs": '{"speed": 2}'}, ("'speed'", "check --env and --env-kwargs")),
         ({"env": "kitchen"}, ("'kitchen'", "tabletop")),
         ({"env": "tabletop", "scene": "E"}, ("'E'", "A, B, C, D")),
         ({"env": "no_such_module:x/Y-v0"}, ("no_such_module:x/Y-v0",)),
