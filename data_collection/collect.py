@@ -11,7 +11,14 @@ from types import FrameType
 
 from tqdm import tqdm
 
-from data_collection.environments import resolve_env, usual_policy, usual_steps, versions
+from data_collection.environments import (
+    extra_kwargs,
+    known_env,
+    resolve_env,
+    usual_policy,
+    usual_steps,
+    versions,
+)
 from data_collection.files import locked, remove_leftovers
 from data_collection.manifest import MANIFEST_NAME, Manifest, read_manifest
 from data_collection.policies import POLICIES
@@ -24,6 +31,8 @@ from data_collection.writer import shard_path
 from envs.command import run
 from envs.errors import UsageError
 
+IMAGE_SIZE = 64  # pixels
+
 
 @dataclass(frozen=True)
 class Config:
@@ -32,11 +41,15 @@ class Config:
     out: Path
     """Folder of the dataset; made if it is not there."""
     env: str = "tabletop"
-    """Environment: a short name (tabletop, planar-push, dexhand), or any Gymnasium id whose environment has a
-    `camera`."""
+    """Environment: a short name (tabletop, planar-push, dexhand), or any Gymnasium id. Another environment must observe
+    rgb, depth and proprio, and have camera, get_state, ACTION_AGGREGATION, ACTION_SCALE and control_rate, as
+    docs/data.md says."""
     scene: str | None = None
     """Scene or split, where the environment has several (tabletop: A, B, C, D, usually C; planar-push: train,
     validation, test, all, usually train)."""
+    env_kwargs: str = "{}"
+    """More keyword arguments of the environment, a JSON object: '{"depth_noise": 0.002}' for planar-push,
+    '{"goal_angle": 90}' for dexhand. docs/environments.md lists them."""
     episodes: int = 400
     """Episodes the dataset shall have; a larger number extends it."""
     steps: int | None = None
@@ -53,8 +66,9 @@ class Config:
     ray: str | None = None
     """Have them on a Ray cluster: HOST:PORT of its head, auto for the one that runs here, local for one that is started
     here and ends with the command. The episodes are the same; only this process writes them."""
-    image_size: int = 64
-    """Height and width of the images, pixels; a multiple of 8 for the world model."""
+    image_size: int | None = None
+    """Height and width of the images, pixels; usually 64, a multiple of 8 for the world model. Another environment is
+    given it as `image_size`, and only if the option is."""
     ground_truth: bool = False
     """Also record what a model never sees: body ids of the pixels and poses of the bodies (for scene flow)."""
     episode_timeout: float = 300.0
@@ -66,6 +80,7 @@ class Config:
             if value is not None and value < least:
                 option = name.replace("_", "-")
                 raise UsageError(f"--{option} is {value}; give a whole number of at least {least}")
+        extra_kwargs(self.env, self.env_kwargs)
         if not self.episode_timeout > 0:
             raise UsageError(f"--episode-timeout is {self.episode_timeout}; give a positive number of seconds")
         if self.policy is not None and self.policy not in POLICIES and not self.policy.endswith(SUFFIX):
@@ -78,10 +93,13 @@ class Config:
 
     def manifest(self) -> Manifest:
         env_id, env_kwargs = resolve_env(self.env, self.scene)
+        size = self.image_size or (IMAGE_SIZE if known_env(self.env) else None)
+        if size is not None:
+            env_kwargs["image_size"] = size
         policy = self.policy or usual_policy(self.env)
         return Manifest(
             env_id=env_id,
-            env_kwargs={**env_kwargs, "image_size": self.image_size},
+            env_kwargs=env_kwargs | extra_kwargs(self.env, self.env_kwargs),
             policy=policy_name(Path(policy)) if policy.endswith(SUFFIX) else policy,
             seed=self.seed,
             steps=usual_steps(self.env) if self.steps is None else self.steps,
@@ -132,12 +150,13 @@ def _begin(manifest: Manifest, folder: Path) -> None:
     if before is None:
         if shards:
             raise UsageError(f"{folder} has shards but no {MANIFEST_NAME}; choose another --out")
-    else:
+    elif shards:  # without any, as after options that did not work, there is nothing to go on with
         manifest.check_continues(before, folder)
+    now = versions()  # once: it reads all of the source
     makers = [read_shard(shard).attrs["versions"] for shard in shards]
-    if any(maker != versions() for maker in makers):
+    if any(maker != now for maker in makers):
         print(f"warning: {folder} holds episodes made by other versions of the programs", file=sys.stderr)
-    if before is None or before.episodes < manifest.episodes:
+    if before is None or not shards or before.episodes < manifest.episodes:
         manifest.save(folder)
 
 

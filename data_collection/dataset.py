@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -205,6 +205,20 @@ class RGBDDataset:
                     return {name: file[name][start:stop] for name in self.columns}
             number -= len(shard.ep_len)
         raise AssertionError("unreachable: lengths and shards agree")
+
+    def stream(self, columns: Sequence[str]) -> Iterator[dict[str, NDArray[Any]]]:
+        """Some columns of one episode after the other, (rows, ...) each, in their stored dtypes.
+
+        Raises:
+            UsageError: no such column, or a shard is damaged.
+        """
+        for name in columns:
+            self._require(name)
+        for shard in self._shards:
+            for start, rows in zip(shard.ep_offset, shard.ep_len, strict=True):
+                with _reading(shard) as file:
+                    episode = {name: file[name][start : start + rows] for name in columns}
+                yield episode
 
     def depth_metres(self, raw: NDArray[np.uint16]) -> NDArray[np.float32]:
         """Stored depth of any shape -> metres, float32."""

@@ -14,12 +14,11 @@ import numpy as np
 
 import data_collection
 import envs  # registers the environments
+from data_collection.requirements import check_env
 from envs.errors import UsageError
 from envs.gl import gl_renderer
 
 PACKAGES = ("t3vip", "mujoco", "robosuite", "gymnasium", "numpy", "h5py")
-NEEDED = ("camera", "get_state", "ACTION_AGGREGATION", "ACTION_SCALE", "control_rate")
-NEEDED_FOR_GROUND_TRUTH = ("segmentation", "body_poses", "body_names", "hand_body_ids")
 
 
 @dataclass(frozen=True)
@@ -72,34 +71,61 @@ def resolve_env(name: str, scene: str | None) -> tuple[str, dict[str, Any]]:
 
 def usual_steps(name: str) -> int:
     """Actions in an episode of an environment, by its short name or Gymnasium id, unless told otherwise."""
-    families = (known for known in KNOWN_ENVS.values() if known.env_id.partition("{")[0] in name)
-    return (KNOWN_ENVS.get(name) or next(families, KnownEnv(name))).steps
+    return (known_env(name) or KnownEnv(name)).steps
 
 
 def usual_policy(name: str) -> str:
-    """Who acts in an environment, by its short name or Gymnasium id, unless told otherwise."""
+    """Who acts in an environment, by its short name or Gymnasium id, unless told otherwise; noise in unknown ones."""
+    known = known_env(name)
+    return known.policy if known else "noise"
+
+
+def known_env(name: str) -> KnownEnv | None:
+    """The environment of this project that a short name or Gymnasium id means; None if it is another's."""
     if name in KNOWN_ENVS:
-        return KNOWN_ENVS[name].policy
-    families = {known.env_id.partition("{")[0]: known.policy for known in KNOWN_ENVS.values()}
-    return next((policy for family, policy in families.items() if family in name), "play")
+        return KNOWN_ENVS[name]
+    return next((known for known in KNOWN_ENVS.values() if known.env_id.partition("{")[0] in name), None)
+
+
+def extra_kwargs(name: str, text: str) -> dict[str, Any]:
+    """Keyword arguments that somebody gives an environment, by its short name or Gymnasium id, as JSON.
+
+    Raises:
+        UsageError: no JSON object of finite numbers, or a keyword that other options choose.
+    """
+
+    def refuse(constant: str) -> None:
+        raise ValueError(f"{constant} is no number")
+
+    try:
+        kwargs = json.loads(text, parse_constant=refuse)
+        if not isinstance(kwargs, dict):
+            raise ValueError(f"it is a {type(kwargs).__name__}")
+    except ValueError as error:
+        example = """'{"depth_noise": 0.002}'"""
+        raise UsageError(f"--env-kwargs is '{text}' ({error}); give a JSON object, as {example}") from error
+    chosen = {"image_size": "--image-size"} | ({"scene": "--env and --scene"} if known_env(name) else {})
+    if name in KNOWN_ENVS:
+        chosen[KNOWN_ENVS[name].scene_keyword] = "--scene"
+    for keyword in kwargs:
+        if keyword in chosen:
+            raise UsageError(f"--env-kwargs has '{keyword}', which is for {chosen[keyword]} to say; leave it out")
+    return kwargs
 
 
 def make_env(env_id: str, env_kwargs: dict[str, Any], ground_truth: bool) -> gymnasium.Env:
     """Make an environment to collect from: no time limit, checked for what a dataset needs.
 
     Raises:
-        UsageError: it cannot be made, or lacks something.
+        UsageError: it cannot be made, lacks something, or observes what a dataset does not store.
     """
     try:
         env = gymnasium.make(env_id, max_episode_steps=-1, disable_env_checker=True, **env_kwargs)
     except (gymnasium.error.Error, ModuleNotFoundError, TypeError) as error:
-        raise UsageError(f"cannot make environment '{env_id}' with {env_kwargs}: {error}; check --env") from error
-    for name in NEEDED + (NEEDED_FOR_GROUND_TRUTH if ground_truth else ()):
-        if not hasattr(env.unwrapped, name):
-            raise UsageError(f"environment '{env_id}' has no attribute '{name}'; it cannot be collected from")
-    for key in ("rgb", "depth", "proprio"):
-        if key not in getattr(env.observation_space, "spaces", {}):
-            raise UsageError(f"environment '{env_id}' does not observe '{key}'; it cannot be collected from")
+        raise UsageError(
+            f"cannot make environment '{env_id}' with {env_kwargs}: {error}; check --env and --env-kwargs"
+        ) from error
+    check_env(env, env_id, ground_truth)
     return env
 
 

@@ -37,7 +37,7 @@ class EpisodeMaker:
             on_step: called before every step, and before the shard is written.
 
         Raises:
-            UsageError: the policy cannot be used.
+            UsageError: the policy or what the environment gave cannot be used.
         """
         run = self._manifest
         policy = make_policy(run.policy)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from data_collection.policies import Policy
 from data_collection.schema import COLUMNS, quantise_depth
+from envs.errors import UsageError
 
 
 def collect_episode(
@@ -36,6 +37,9 @@ def collect_episode(
 
     Returns:
         the columns of the schema, (steps + 1, ...) each, and whether the episode ended in a terminal state.
+
+    Raises:
+        UsageError: the environment gave colours or ids that a dataset does not store.
     """
     env_seeds, policy_seeds = np.random.SeedSequence((seed, episode)).spawn(2)
     obs, info = env.reset(seed=int(env_seeds.generate_state(1)[0] >> 1))
@@ -65,8 +69,21 @@ def collect_episode(
     if "joint_delta" in rows:
         rows["joint_delta"].append(np.zeros_like(rows["joint_delta"][-1]))
     rows["depth"] = [quantise_depth(frame, camera.near, camera.far) for frame in rows["depth"]]
-    columns = {name: np.stack(rows[name]).astype(COLUMNS[name].dtype) for name in COLUMNS if name in rows}
+    columns = {name: _stored(name, np.stack(rows[name])) for name in COLUMNS if name in rows}
     return columns, bool(terminated)
+
+
+def _stored(name: str, values: NDArray[Any]) -> NDArray[Any]:
+    """A column in the dtype of the schema; colours and ids that would wrap or be cut off are refused."""
+    dtype = np.dtype(COLUMNS[name].dtype)
+    if dtype.kind == "u" and values.dtype != dtype:
+        low, high, most = values.min(), values.max(), np.iinfo(dtype).max
+        if values.dtype.kind not in "iu" or low < 0 or high > most:
+            raise UsageError(
+                f"the environment gave '{name}' as {values.dtype} from {low} to {high}; "
+                f"a dataset stores whole numbers from 0 to {most}"
+            )
+    return values.astype(dtype)
 
 
 def _record(

@@ -12,6 +12,8 @@ from data_collection.goal_statistics import goal_statistics
 
 VOXEL = 0.05  # metres: edge of the cells in which workspace coverage is counted
 
+BY_NUMBER = ("action", "proprio", "scene_obs")
+"""Columns of a few numbers a row, each with a meaning of its own."""
 SCENE_PARTS: dict[str, tuple[int, float]] = {
     "slider": (0, 0.02),
     "drawer": (1, 0.02),
@@ -43,7 +45,7 @@ def describe(dataset: RGBDDataset) -> dict[str, Any]:
         "bytes": sum(path.stat().st_size for path in dataset.files),
         "versions": dataset.makers,
         "content_hash": dataset.content_hash,
-        "columns": {name: column_range(dataset, name) for name in dataset.columns},
+        "columns": column_ranges(dataset),
     }
     proprio = dataset.load("proprio")
     if "workspace" in dataset.attrs and proprio.shape[1] >= 3:
@@ -55,21 +57,37 @@ def describe(dataset: RGBDDataset) -> dict[str, Any]:
     return report
 
 
-def column_range(dataset: RGBDDataset, name: str) -> dict[str, Any]:
-    """Row shape, dtype and range of a column; depth in metres, flat columns number by number."""
-    values = dataset.load(name)
-    summary: dict[str, Any] = {"shape": list(values.shape), "dtype": str(values.dtype)}
-    if name == "depth":
-        low, high = dataset.depth_metres(np.array([values.min(), values.max()]))
-        return {**summary, "unit": "m", "min": round(float(low), 4), "max": round(float(high), 4)}
-    if values.ndim == 2 and name in ("action", "proprio", "scene_obs"):
-        return {
-            **summary,
-            "min": np.round(values.min(axis=0), 4).tolist(),
-            "max": np.round(values.max(axis=0), 4).tolist(),
-            "std": np.round(values.std(axis=0, dtype=np.float64), 4).tolist(),
-        }
-    return {**summary, "min": float(values.min()), "max": float(values.max())}
+def column_ranges(dataset: RGBDDataset) -> dict[str, dict[str, Any]]:
+    """Shape, dtype and range of the columns; depth in metres, what is in `BY_NUMBER` number by number.
+
+    The others are read episode by episode: there may be more pictures and states than fit in memory.
+    """
+    ranges = {name: _range_by_number(dataset.load(name)) for name in BY_NUMBER if name in dataset.columns}
+    others = [name for name in dataset.columns if name not in ranges]
+    ends: dict[str, list[Any]] = {name: [] for name in others}
+    for episode in dataset.stream(others):
+        for name, values in episode.items():
+            ends[name] += [values.min(), values.max()]
+            shape = [int(dataset.episode_lengths.sum()), *values.shape[1:]]
+            ranges[name] = {"shape": shape, "dtype": str(values.dtype)}
+    for name in others:
+        low, high = np.min(ends[name]), np.max(ends[name])
+        if name == "depth":
+            near, far = dataset.depth_metres(np.array([low, high]))
+            ranges[name] |= {"unit": "m", "min": round(float(near), 4), "max": round(float(far), 4)}
+        else:
+            ranges[name] |= {"min": float(low), "max": float(high)}
+    return {name: ranges[name] for name in dataset.columns}
+
+
+def _range_by_number(values: NDArray[Any]) -> dict[str, Any]:
+    return {
+        "shape": list(values.shape),
+        "dtype": str(values.dtype),
+        "min": np.round(values.min(axis=0), 4).tolist(),
+        "max": np.round(values.max(axis=0), 4).tolist(),
+        "std": np.round(values.std(axis=0, dtype=np.float64), 4).tolist(),
+    }
 
 
 def workspace_coverage(tcp: NDArray[Any], workspace: NDArray[Any]) -> dict[str, Any]:

@@ -48,6 +48,8 @@ class RGBDEnv(gymnasium.Env):
     """How each number of an action adds up over a frame gap: "sum", "rotate" or "last"."""
     ACTION_SCALE: tuple[float, ...]
     """What 1 stands for in each number of an action, m, rad or a sign."""
+    SIGNS: ClassVar[tuple[int, ...]] = ()
+    """Which numbers of an action are signs, as a gripper's is: nothing but being below 0 or not counts."""
     control_rate: ClassVar[int]
     """Control steps in a second."""
 

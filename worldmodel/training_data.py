@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from data_collection.dataset import RGBDDataset
 from envs.errors import UsageError
+from envs.planar_push.objects import SPLITS, canonical
 from worldmodel.clips import HELD, ClipSource
 from worldmodel.config import ModelContext
 from worldmodel.memory import available_memory
@@ -33,7 +34,7 @@ def open_data(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
             raise UsageError(
                 f"{opened.path} comes from {TEST_ONLY}, the test scene; train and validate on scene A, B or C"
             )
-        if opened.attrs["env_kwargs"].get("split") in TEST_SPLITS:
+        if _has_test_objects(opened):
             raise UsageError(
                 f"{opened.path} holds objects for testing only; collect with --scene train and --scene validation"
             )
@@ -67,6 +68,12 @@ def _memory_limit(options: TrainOptions) -> float:
     if options.memory_limit is not None:
         return 1e9 * options.memory_limit
     return FREE_SHARE * available_memory() / processes_here()
+
+
+def _has_test_objects(dataset: RGBDDataset) -> bool:
+    kwargs = dataset.attrs["env_kwargs"]
+    one = kwargs.get("object") if "PlanarPush" in str(dataset.attrs["env_id"]) else None
+    return kwargs.get("split") in TEST_SPLITS or (one is not None and canonical(one) in SPLITS["test"])
 
 
 def _same_world(train: RGBDDataset, other: RGBDDataset) -> None:

@@ -60,10 +60,8 @@ class NoisePolicy:
         space = env.action_space
         assert isinstance(space, gymnasium.spaces.Box)
         self._low, self._high, self._rng = space.low.astype(np.float64), space.high.astype(np.float64), rng
-        # A sign (gripper) is held by the noise's sign: a smooth command that seldom flips. Hands that take targets
-        # take them as they are.
-        kinds = getattr(env.unwrapped, "ACTION_AGGREGATION", ("sum",) * len(self._low))
-        self._signs = np.array([kind == "last" for kind in kinds]) & ~np.all([kind == "last" for kind in kinds])
+        # A sign (gripper) is held by the noise's sign: a smooth command that seldom flips.
+        self._signs = np.isin(np.arange(len(self._low)), getattr(env.unwrapped, "SIGNS", ()))
         self._step = self._block
 
     def act(self, obs: dict[str, Any]) -> NDArray[Any]:

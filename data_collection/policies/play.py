@@ -22,6 +22,8 @@ from data_collection.policies.play_motion import (
     rotation_between,
 )
 from data_collection.policies.play_scene import Scene
+from envs.errors import UsageError
+from envs.tabletop import TabletopEnv
 from envs.tabletop.table import BLOCKS
 
 WEIGHTS = {"drawer": 1.3, "door": 1.4, "switch": 1.2, "button": 0.9} | dict.fromkeys(BLOCKS, 1.2)  # sooner or later
@@ -33,6 +35,13 @@ class PlayPolicy:
     """Plays with a tabletop environment; privileged. Skills that fail are abandoned after a while."""
 
     def reset(self, env: gymnasium.Env, rng: np.random.Generator) -> None:
+        """Start an episode.
+
+        Raises:
+            UsageError: not a tabletop.
+        """
+        if not isinstance(env.unwrapped, TabletopEnv):
+            raise UsageError(f"policy 'play' cannot act in {type(env.unwrapped).__name__}; use --env tabletop")
         self._rng = rng
         self._scene = Scene(env)
         self._scale = np.asarray(self._scene.env.ACTION_SCALE[:6], dtype=np.float64)

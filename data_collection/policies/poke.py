@@ -27,6 +27,8 @@ TRIES = 20
 class PokePolicy(PushPolicy):
     """Mixes the pushes of `PushPolicy` with moves that may or may not touch the object; privileged."""
 
+    NAME = "poke"
+
     def _next_push(self) -> Iterator[NDArray[np.float32]]:
         kind = self._rng.choice(list(SHARES), p=list(SHARES.values()))
         if kind == "push":

@@ -24,6 +24,8 @@ STRIDE = 0.0125  # m a control step on the way round: no faster than pushes of 0
 class PushPolicy:
     """Pushes the object of a planar pushing environment about; privileged."""
 
+    NAME = "push"
+
     def reset(self, env: gymnasium.Env, rng: np.random.Generator) -> None:
         """Start an episode.
 
@@ -31,7 +33,8 @@ class PushPolicy:
             UsageError: not a planar pushing environment.
         """
         if not isinstance(env.unwrapped, PlanarPushEnv):
-            raise UsageError(f"policy 'push' cannot act in {type(env.unwrapped).__name__}; use --env planar-push")
+            stranger = type(env.unwrapped).__name__
+            raise UsageError(f"policy '{self.NAME}' cannot act in {stranger}; use --env planar-push")
         self._env, self._rng = env.unwrapped, rng
         self._last_direction: Array | None = None
         self._plan: Iterator[NDArray[np.float32]] = iter(())

@@ -17,6 +17,7 @@ from envs.tabletop.scene import CONTROL_RATE
 
 ACTION_SCALE = (0.02, 0.02, 0.02, 0.05, 0.05, 0.05, 1.0)  # m, rad, sign
 ACTION_AGGREGATION = ("sum", "sum", "sum", "rotate", "rotate", "rotate", "last")
+SIGNS = (6,)  # the gripper
 WORKSPACE_LOW, WORKSPACE_HIGH = np.array([-0.32, -0.46, 0.30]), np.array([0.34, 0.10, 0.78])  # m, of the target
 MAX_LEAD, MAX_TURN_LEAD = 0.03, 0.10  # m, rad: how far the target may be from the measured pose
 

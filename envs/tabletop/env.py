@@ -46,6 +46,7 @@ class TabletopEnv(RGBDEnv):
     OWN_STATE = 2  # LED, button
     ACTION_AGGREGATION = control.ACTION_AGGREGATION
     ACTION_SCALE = control.ACTION_SCALE
+    SIGNS = control.SIGNS
     control_rate = CONTROL_RATE
 
     def __init__(

@@ -26,6 +26,7 @@ ENV_ID = "standin:standin/Square-v0"
 def options(out, **changed):
     """Command line of `collect-rollouts` on the stand-in environment."""
     chosen = {"env": ENV_ID, "episodes": 4, "steps": 8, "image-size": 16, "policy": "noise", "workers": 1, **changed}
+    chosen = {name: value for name, value in chosen.items() if value is not None}
     flags = [flag for name, value in chosen.items() if value is not True for flag in (f"--{name}", str(value))]
     return ["--out", str(out), *flags, *(f"--{name}" for name, value in chosen.items() if value is True)]
 

@@ -21,6 +21,7 @@ NEAR, FAR = 1.0, 3.0
 class StandIn(gymnasium.Env):
     ACTION_AGGREGATION = ("sum", "sum", "last")
     ACTION_SCALE = (0.1, 0.1, 1.0)
+    SIGNS = (2,)
     control_rate = 10
     body_names = ("world", "square")
     hand_body_ids = (1,)
@@ -106,6 +107,20 @@ class Ending(StandIn):
 
 
 gymnasium.register("standin/Ending-v0", entry_point=Ending)
+
+
+class Paced(StandIn):
+    """Of one size, with a keyword of its own: how far the square goes, against the stand-in's."""
+
+    def __init__(self, pace: float = 1.0) -> None:
+        super().__init__()
+        self.pace = pace
+
+    def step(self, action):
+        return super().step(self.pace * action)
+
+
+gymnasium.register("standin/Paced-v0", entry_point=Paced)
 
 
 class Blind(gymnasium.Env):

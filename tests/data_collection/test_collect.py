@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -13,6 +14,7 @@ from standin import FAR, NEAR, StandIn, reset_seed
 
 from data_collection.collect import Config, main
 from data_collection.dataset import RGBDDataset
+from data_collection.environments import versions
 from data_collection.episodes import EpisodeMaker
 from data_collection.files import locked
 from data_collection.manifest import Manifest
@@ -175,9 +177,51 @@ def test_two_collectors_in_one_folder(tmp_path):
         main(Config(**arguments(tmp_path)))
 
 
+def test_an_environments_own_keywords_are_part_of_what_episodes_are(tmp_path):
+    given = {"env": "standin:standin/Paced-v0", "image-size": None, "env-kwargs": '{"pace": 0.5}'}
+    code, _, err = call("collect-rollouts", options(tmp_path, episodes=1, **given))
+    assert code == 0, err
+    dataset = RGBDDataset(tmp_path)
+    assert dataset.attrs["env_kwargs"] == {"pace": 0.5} and dataset.camera.width == 16
+    moves = np.diff(dataset.load("proprio")[:, :2], axis=0)
+    np.testing.assert_allclose(moves, 0.5 * 0.1 * dataset.load("action")[:-1, :2], atol=1e-6)
+    assert call("collect-rollouts", options(tmp_path, episodes=1, **given))[0] == 0
+    result = call("collect-rollouts", options(tmp_path, episodes=1, **{**given, "env-kwargs": '{"pace": 0.1}'}))
+    assert_one_line_error(result, "was collected with env_kwargs = {'pace': 0.5}", "choose another --out")
+
+
+@pytest.mark.parametrize(
+    ("changed", "kwargs"),
+    [
+        ({"env": "tabletop"}, {"image_size": 64}),
+        ({"env": "t3vip/TabletopD-v0", "image_size": 32}, {"image_size": 32}),
+        ({"env": "planar-push"}, {"split": "train", "image_size": 64}),
+        ({"env": "t3vip/PlanarPush-v0", "env_kwargs": '{"split": "all"}'}, {"split": "all", "image_size": 64}),
+        (
+            {"env": "planar-push", "scene": "test", "env_kwargs": '{"depth_noise": 0.002}'},
+            {"split": "test", "image_size": 64, "depth_noise": 0.002},
+        ),
+        ({"env": "dexhand"}, {"new_goals": True, "image_size": 64}),
+        ({"env": "dexhand", "env_kwargs": '{"new_goals": false}'}, {"new_goals": False, "image_size": 64}),
+        ({"env": "my/Env-v0"}, {}),
+        ({"env": "my/Env-v0", "image_size": 64, "env_kwargs": '{"scene": "D"}'}, {"image_size": 64, "scene": "D"}),
+    ],
+)
+def test_keyword_arguments_that_environments_get(tmp_path, changed, kwargs):
+    assert Config(tmp_path, **changed).manifest().env_kwargs == kwargs
+
+
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
+        ({"env-kwargs": "pace=2"}, ("--env-kwargs is 'pace=2'", "JSON object")),
+        ({"env-kwargs": "[1]"}, ("--env-kwargs is '[1]'", "it is a list")),
+        ({"env-kwargs": '{"pace": NaN}'}, ("--env-kwargs", "NaN is no number")),
+        ({"env-kwargs": '{"image_size": 8}'}, ("'image_size'", "--image-size")),
+        ({"env": "tabletop", "env-kwargs": '{"scene": "D"}'}, ("'scene'", "--scene")),
+        ({"env": "t3vip/TabletopC-v0", "env-kwargs": '{"scene": "D"}'}, ("'scene'", "--env")),
+        ({"env": "planar-push", "env-kwargs": '{"split": "test"}'}, ("'split'", "--scene")),
+        ({"env-kwargs": '{"speed": 2}'}, ("'speed'", "check --env and --env-kwargs")),
         ({"env": "kitchen"}, ("'kitchen'", "tabletop")),
         ({"env": "tabletop", "scene": "E"}, ("'E'", "A, B, C, D")),
         ({"env": "no_such_module:x/Y-v0"}, ("no_such_module:x/Y-v0",)),
@@ -199,6 +243,15 @@ def test_a_place_below_a_file_is_one_line(tmp_path):
     )
 
 
+def test_policy_of_another_environment_is_told_at_once_and_leaves_the_folder_free(tmp_path):
+    result = call("collect-rollouts", options(tmp_path, policy="play"))
+    assert_one_line_error(result, "policy 'play' cannot act in StandIn", "--env tabletop")
+    assert "lost episode" not in result[2] and not list(tmp_path.glob("*.h5"))
+    code, _, err = call("collect-rollouts", options(tmp_path, episodes=1))
+    assert code == 0, err
+    assert json.loads((tmp_path / "dataset.json").read_text())["policy"] == "noise"
+
+
 def test_environment_that_does_not_observe_depth(tmp_path):
     with pytest.raises(UsageError, match="has no attribute 'camera'"):
         main(Config(**arguments(tmp_path, env="standin:standin/Blind-v0")))
@@ -209,6 +262,13 @@ def test_going_on_with_other_programs_is_told(tmp_path, monkeypatch):
     assert "other versions" not in call("collect-rollouts", options(tmp_path, episodes=1))[2]
     monkeypatch.setattr("data_collection.collect.versions", lambda: {"source": "changed"})
     assert "made by other versions" in call("collect-rollouts", options(tmp_path, episodes=1))[2]
+
+
+def test_going_on_reads_the_source_once_however_many_episodes_there_are(collected, tmp_path, monkeypatch):
+    folder, calls = shutil.copytree(collected, tmp_path / "data"), []
+    monkeypatch.setattr("data_collection.collect.versions", lambda: calls.append(1) or versions())
+    main(Config(**arguments(folder, ground_truth=True)))
+    assert len(calls) == 1
 
 
 def test_damaged_shard_stops_resuming(collected, tmp_path):

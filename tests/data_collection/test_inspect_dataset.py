@@ -14,7 +14,7 @@ from data_collection.files import locked
 from data_collection.goal_statistics import goal_statistics
 from data_collection.repair import find_damage, repair
 from data_collection.schema import episode_hash
-from data_collection.statistics import moved_shares, workspace_coverage
+from data_collection.statistics import BY_NUMBER, column_ranges, moved_shares, workspace_coverage
 from data_collection.writer import write_shard
 from envs.dexhand.goals import HOME
 from envs.errors import UsageError
@@ -42,6 +42,22 @@ def test_report_table_and_pictures(folder):
     film = imageio.mimread(folder / "inspection" / "episodes.mp4", memtest=False)
     assert len(film) == 9 and film[0].shape == (2 * 128 + 4, 3 * (128 + 4), 3)
     assert np.ptp(film[0]) > 100
+
+
+def test_ranges_are_of_whole_columns_and_only_short_rows_are_held_in_memory(collected, monkeypatch):
+    dataset, loaded, load = RGBDDataset(collected), [], RGBDDataset.load
+    monkeypatch.setattr(RGBDDataset, "load", lambda self, name: loaded.append(name) or load(self, name))
+    ranges = column_ranges(dataset)
+    assert set(loaded) <= set(BY_NUMBER) and tuple(ranges) == dataset.columns
+    for name, found in ranges.items():
+        whole = load(dataset, name)
+        assert found["shape"] == list(whole.shape) and found["dtype"] == str(whole.dtype)
+        axis = 0 if name in BY_NUMBER else None
+        low, high = whole.min(axis), whole.max(axis)
+        if name == "depth":
+            low, high = dataset.depth_metres(np.array([low, high]))
+        np.testing.assert_allclose(found["min"], low, atol=1e-4)
+        np.testing.assert_allclose(found["max"], high, atol=1e-4)
 
 
 def test_repair_drops_what_is_damaged_and_collecting_makes_it_again(folder):

@@ -12,6 +12,8 @@ from data_collection.policies.play import PlayPolicy
 from data_collection.policies.play_motion import POINTING_DOWN, Follower, hand_orientation, rotation_between
 from data_collection.policies.play_scene import Scene
 from data_collection.policies.play_skills import FIXTURE_SKILLS
+from envs.errors import UsageError
+from envs.planar_push import PlanarPushEnv
 from envs.tabletop.table import BLOCKS
 
 STEPS, EPISODES = 240, 14
@@ -53,6 +55,13 @@ def test_the_same_seeds_play_the_same(env):
     for one, other in zip(first, play(env, 3, 80, policy), strict=True):
         np.testing.assert_array_equal(one, other)
     assert not np.array_equal(first[0], play(env, 4, 80, policy)[0])
+
+
+def test_it_refuses_other_environments():
+    other = PlanarPushEnv(images=False)
+    with pytest.raises(UsageError, match="policy 'play' cannot act in PlanarPushEnv; use --env tabletop"):
+        PlayPolicy().reset(other, np.random.default_rng(0))
+    other.close()
 
 
 def test_actions_are_bounded_and_use_their_range(env, episodes):

@@ -8,6 +8,7 @@ from standin import StandIn
 from data_collection.policies import make_policy
 from data_collection.policies.coloured_noise import NoisePolicy, coloured_noise
 from envs.errors import UsageError
+from envs.planar_push import PlanarPushEnv
 
 
 @pytest.mark.parametrize("beta", [0.0, 0.7, 2.0, 3.5])
@@ -52,6 +53,17 @@ def test_noise_is_smoother_than_random_and_commands_signs_as_signs():
 
     assert jump(smooth) < jump(rough) / 2
     assert set(np.unique(smooth[:, 2])) == {-1.0, 1.0}
+
+
+def test_noise_spreads_over_absolute_targets_that_are_no_signs():
+    env = PlanarPushEnv(images=False)
+    env.reset(seed=0)
+    policy = make_policy("noise")
+    policy.reset(env, np.random.default_rng(0))
+    heading = np.stack([policy.act({}) for _ in range(400)])[:, 2]
+    env.close()
+    assert len(np.unique(heading)) > 200 and (np.abs(heading) < 0.9).mean() > 0.6
+    assert np.histogram(heading, 8, (-1, 1))[0].min() > 0
 
 
 def test_noise_goes_on_after_its_block():

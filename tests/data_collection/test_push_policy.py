@@ -91,10 +91,11 @@ def test_an_object_at_the_edge_is_brought_back():
     env.close()
 
 
-def test_it_refuses_other_environments():
+@pytest.mark.parametrize("name", ["push", "poke"])
+def test_it_refuses_other_environments(name):
     env = TabletopEnv(images=False)
-    with pytest.raises(UsageError, match="planar-push"):
-        make_policy("push").reset(env, np.random.default_rng(0))
+    with pytest.raises(UsageError, match=f"policy '{name}' cannot act in TabletopEnv; use --env planar-push"):
+        make_policy(name).reset(env, np.random.default_rng(0))
     env.close()
 
 
@@ -104,6 +105,7 @@ def test_environments_have_their_usual_scenes_and_policies():
     assert resolve_env("tabletop", None) == ("t3vip/TabletopC-v0", {})
     assert usual_policy("planar-push") == usual_policy("envs:t3vip/PlanarPush-v0") == "push"
     assert usual_policy("tabletop") == usual_policy("t3vip/TabletopD-v0") == "play"
+    assert usual_policy("my/Env-v0") == "noise"
     for name, scene in (("planar-push", "D"), ("tabletop", "train"), ("my/Env-v0", "C")):
         with pytest.raises(UsageError, match=scene):
             resolve_env(name, scene)

@@ -1,0 +1,85 @@
+"""What an environment must be like to be collected from; what is not stored as it was given is refused."""
+
+import gymnasium
+import numpy as np
+import pytest
+from standin import StandIn
+
+from data_collection.environments import make_env
+from data_collection.policies.random import RandomPolicy
+from data_collection.rollout import collect_episode
+from envs.errors import UsageError
+
+BOX = gymnasium.spaces.Box
+ID = "requirements/Odd-v0"
+
+
+class Odd(StandIn):
+    """The stand-in, with something else as it should not be."""
+
+    def __init__(self, observes=None, acts=None, **attributes) -> None:
+        super().__init__()
+        self.observation_space = gymnasium.spaces.Dict({**self.observation_space.spaces, **(observes or {})})
+        self.action_space = acts or self.action_space
+        for name, value in attributes.items():
+            setattr(self, name, value)
+
+
+gymnasium.register(ID, entry_point=Odd)
+
+
+@pytest.mark.parametrize(
+    ("odd", "words"),
+    [
+        ({"observes": {"rgb": BOX(0, 1, (16, 16, 3), np.float32)}}, r"'rgb' as float32 \(16, 16, 3\).*needs uint8"),
+        ({"observes": {"rgb": BOX(0, 255, (3, 16, 16), np.uint8)}}, r"'rgb' as uint8 \(3, 16, 16\).*\(16, 16, 3\)"),
+        (
+            {"observes": {"rgb": BOX(0, 255, (24, 24, 3), np.uint8)}},
+            r"\(24, 24, 3\).*\(16, 16, 3\), as its camera",
+        ),
+        ({"observes": {"depth": BOX(0, 65535, (16, 16), np.uint16)}}, "'depth' as uint16.*metres"),
+        ({"observes": {"depth": BOX(1, 3, (16, 16, 1), np.float32)}}, r"'depth' as float32 \(16, 16, 1\).*\(16, 16\)"),
+        ({"observes": {"proprio": BOX(-1, 1, (2, 3), np.float32)}}, r"'proprio' as float32 \(2, 3\).*a vector"),
+        ({"acts": gymnasium.spaces.Discrete(4)}, r"takes actions Discrete\(4\)"),
+        ({"camera": "static"}, "has a str as camera"),
+        ({"body_names": ["part"] * 257}, "257 bodies.*256; leave out --ground-truth"),
+    ],
+)
+def test_what_a_dataset_does_not_store_is_refused_before_an_episode(odd, words):
+    with pytest.raises(UsageError, match=words):
+        make_env(ID, odd, ground_truth=True)
+
+
+def test_256_bodies_will_do_and_more_without_ground_truth():
+    make_env(ID, {"body_names": ["part"] * 256}, ground_truth=True)
+    make_env(ID, {"body_names": ["part"] * 300}, ground_truth=False)
+
+
+class Liar(StandIn):
+    """Gives other pictures than its spaces say."""
+
+    def _observe(self):
+        return {**super()._observe(), "rgb": np.full((16, 16, 3), 0.5)}
+
+
+class Crowd(StandIn):
+    def segmentation(self):
+        return np.full((16, 16), 256, np.int32)
+
+
+class Nowhere(StandIn):
+    def segmentation(self):
+        return np.full((16, 16), -1, np.int32)
+
+
+@pytest.mark.parametrize(
+    ("env", "words"),
+    [
+        (Liar, "'rgb' as float64 from 0.5 to 0.5; .* whole numbers from 0 to 255"),
+        (Crowd, "'segmentation' as int32 from 256 to 256"),
+        (Nowhere, "'segmentation' as int32 from -1 to -1"),
+    ],
+)
+def test_colours_and_ids_that_do_not_fit_are_refused(env, words):
+    with pytest.raises(UsageError, match=words):
+        collect_episode(env(), RandomPolicy(), 2, seed=0, episode=0, ground_truth=True)
