@@ -55,6 +55,13 @@ class LearnedController(PlanningController):
         self.executed: deque[NDArray] = deque(maxlen=self.context_frames - 1)
 
     def decide(self, observation: Observation) -> NDArray:
+        self.watch(observation)
+        move = super().decide(observation)
+        self.executed.append(self.aggregated(move))
+        return move
+
+    def watch(self, observation: Observation) -> None:
+        """Take in a frame that the model is to be shown."""
         pixels = self.follower.pixels(observation, self.camera)
         if not self.frames:  # nothing came before: the first frame, standing still
             before = self.context_frames - 1
@@ -63,14 +70,15 @@ class LearnedController(PlanningController):
             self.executed.extend([self.aggregated(np.zeros(self.effector.axes))] * before)
         self.frames.append(observation)
         self.designated.append(pixels)
-        move = super().decide(observation)
-        self.executed.append(self.aggregated(move))
-        return move
 
     def aggregated(self, moves: NDArray) -> NDArray[np.float32]:
         """The actions (..., action_dim) of the model for moves (..., axes), each held for a frame gap."""
-        held = np.repeat(self.effector.action(moves)[..., None, :], self.hold, axis=-2)
-        return aggregate_actions(held, self.model.context.action_aggregation, self.model.context.action_scale)
+        return self.held(self.effector.action(moves))
+
+    def held(self, actions: NDArray) -> NDArray[np.float32]:
+        """The actions (..., action_dim) of the model for those of the environment, each held for a frame gap."""
+        repeated = np.repeat(actions[..., None, :], self.hold, axis=-2)
+        return aggregate_actions(repeated, self.model.context.action_aggregation, self.model.context.action_scale)
 
     def observed(self) -> Any:
         """The model's state after the frames so far."""
