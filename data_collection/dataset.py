@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from data_collection.attributes import check_attributes
 from data_collection.schema import (
     COLUMNS,
     GROUND_TRUTH,
@@ -41,7 +42,8 @@ class RGBDDataset:
         columns: the columns that will be read; None means all that the schema requires, and reading whatever is there.
 
     Raises:
-        UsageError: the folder or a column is missing, a shard is damaged, or the shards do not belong together.
+        UsageError: the folder or a column is missing, a shard is damaged, its attributes do not fit its columns, or the
+            shards do not belong together.
     """
 
     def __init__(self, path: str | Path, columns: Sequence[str] | None = None) -> None:
@@ -53,12 +55,12 @@ class RGBDDataset:
             raise UsageError(f"no {SHARD_PATTERN} in {self.path}; give a folder of collect-rollouts or import-dataset")
         self._shards = [read_shard(shard) for shard in paths]
         required = [name for name, column in COLUMNS.items() if column.required] if columns is None else list(columns)
+        self.camera: CameraModel = _camera_of(self._shards[0])
         for shard in self._shards:
             self._check(shard, required)
         present = set.intersection(*(set(shard.columns) for shard in self._shards))
         self.columns: tuple[str, ...] = tuple(n for n in COLUMNS if n in present and (columns is None or n in columns))
         self.attrs: dict[str, Any] = self._shards[0].attrs
-        self.camera: CameraModel = CameraModel.from_json(json.dumps(self.attrs["camera"]))
         self.has_ground_truth: bool = set(GROUND_TRUTH) <= present
         self.episode_lengths: NDArray[np.int64] = np.concatenate([shard.ep_len for shard in self._shards])
 
@@ -82,6 +84,7 @@ class RGBDDataset:
                     f"{shard.path} has {name} = {shard.attrs[name]!r} but {first.path.name} has "
                     f"{first.attrs[name]!r}; keep one dataset in a folder"
                 )
+        check_attributes(shard.attrs, shard.columns, self.camera, str(shard.path))
 
     def __len__(self) -> int:
         return len(self.episode_lengths)
@@ -238,6 +241,13 @@ class RGBDDataset:
     def _require(self, column: str) -> None:
         if column not in self.columns:
             raise UsageError(f"no column '{column}' in {self.path}; it has {', '.join(self.columns)}")
+
+
+def _camera_of(shard: Shard) -> CameraModel:
+    try:
+        return CameraModel.from_dict(shard.attrs["camera"])
+    except UsageError as error:
+        raise UsageError(f"{shard.path}: {error}") from error
 
 
 class _reading:

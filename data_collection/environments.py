@@ -136,16 +136,11 @@ def describe_env(env: gymnasium.Env, env_id: str, env_kwargs: dict[str, Any]) ->
         UsageError: no OpenGL works.
     """
     inner: Any = env.unwrapped
-    camera = inner.camera
     attrs = {
         "env_id": env_id,
         "env_kwargs": env_kwargs,
         "control_rate": float(inner.control_rate),
-        "K": camera.K,
-        "world_T_camera": camera.world_T_camera,
-        "near": camera.near,
-        "far": camera.far,
-        "camera": json.loads(camera.to_json()),
+        "camera": inner.camera.to_dict(),
         "action_aggregation": list(inner.ACTION_AGGREGATION),
         "action_scale": [float(unit) for unit in inner.ACTION_SCALE],
         "body_names": list(getattr(inner, "body_names", [])),

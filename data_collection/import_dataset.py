@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import sys
 from dataclasses import dataclass
@@ -124,18 +123,13 @@ def main(config: Config) -> None:
 
 def describe(source: Source) -> dict[str, Any]:
     """The attributes of a shard that follow from the source."""
-    camera = source.camera
     return {
         "env_id": source.env_id,
         "env_kwargs": {},
         "policy": "recorded",
         "seed": 0,
         "control_rate": source.control_rate,
-        "K": camera.K,
-        "world_T_camera": camera.world_T_camera,
-        "near": camera.near,
-        "far": camera.far,
-        "camera": json.loads(camera.to_json()),
+        "camera": source.camera.to_dict(),
         "action_aggregation": list(source.action_aggregation),
         "action_scale": list(source.action_scale),
         "body_names": [],
@@ -151,7 +145,7 @@ def _content(config: Config, source: Source) -> dict[str, Any]:
         "format": config.format,
         "env_id": source.env_id,
         "split": source.split,
-        "camera": json.loads(source.camera.to_json()),
+        "camera": source.camera.to_dict(),
         "depth_scale": config.depth_scale,
         "steps": config.steps,
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from data_collection.attributes import FROM_CAMERA, complete_attributes
 from data_collection.files import locked, remove_leftovers
 from data_collection.schema import SHARD_PATTERN, DamagedShard
 from data_collection.writer import intact_episodes, read_episode, write_shard
@@ -37,7 +38,8 @@ def repair(folder: Path) -> list[str]:
         one line for each thing done; `collect-rollouts` makes dropped episodes again.
 
     Raises:
-        UsageError: the folder is missing, or a collector is writing to it.
+        UsageError: the folder is missing, a collector is writing to it, or a shard is whole but its writer left out
+            attributes or gave some that do not fit.
     """
     if not folder.is_dir():
         raise UsageError(f"no dataset folder {folder}; give the folder that collect-rollouts wrote")
@@ -57,9 +59,10 @@ def _repair_shard(path: Path) -> list[str]:
         return []
     kept = [number for number, whole in enumerate(intact) if whole]
     episodes = [read_episode(shard, number) for number in kept]
+    attrs = {name: value for name, value in shard.attrs.items() if name not in ("schema", *FROM_CAMERA)}
+    complete_attributes(attrs, shard.columns)  # what cannot be written again is not moved
     aside = _move_aside(path)
     if kept:
-        attrs = {name: value for name, value in shard.attrs.items() if name != "schema"}
         ended = [bool(shard.ep_terminated[number]) for number in kept]
         write_shard(path, episodes, attrs, [int(shard.ep_index[number]) for number in kept], ended)
     dropped = ", ".join(str(index) for index, whole in zip(shard.ep_index, intact, strict=True) if not whole)

@@ -142,8 +142,8 @@ def read_shard(path: Path) -> Shard:
     """Read and check a shard's tables and attributes; the columns' values are left alone.
 
     Raises:
-        DamagedShard: it does not open, or something that every shard has is missing or disagrees.
-        UsageError: it was written in another version of the schema.
+        DamagedShard: it does not open, or its tables and columns are missing or disagree.
+        UsageError: it was written in another version of the schema, or without an attribute.
     """
     try:
         with h5py.File(path, "r") as file:
@@ -180,7 +180,7 @@ def read_shard(path: Path) -> Shard:
 
 def _read_attributes(path: Path, file: h5py.File) -> dict[str, Any]:
     if "schema" not in file.attrs:
-        raise DamagedShard(path, "no attribute 'schema': not a shard of this project")
+        raise UsageError(f"{path} has no attribute 'schema': it is no shard of this project; take it out of the folder")
     version = int(file.attrs["schema"])
     if version != SCHEMA_VERSION:
         raise UsageError(
@@ -189,7 +189,7 @@ def _read_attributes(path: Path, file: h5py.File) -> dict[str, Any]:
         )
     missing = [name for name in ATTRIBUTES if name not in file.attrs]
     if missing:
-        raise DamagedShard(path, f"no attribute {missing[0]!r}")
+        raise UsageError(f"{path} has no attribute '{missing[0]}'; write it with all that docs/data.md lists")
     return {name: _decode(name, value) for name, value in file.attrs.items()}
 
 

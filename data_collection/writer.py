@@ -15,8 +15,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from data_collection.attributes import complete_attributes
 from data_collection.files import written_aside
-from data_collection.schema import COLUMNS, SCHEMA_VERSION, Shard, encode_attributes, episode_hash, read_shard
+from data_collection.schema import COLUMNS, Shard, encode_attributes, episode_hash, read_shard
 
 CHUNK_BYTES = 1 << 19  # a chunk is a run of frames of one clip; half a megabyte stays in the cache while it is unpacked
 
@@ -38,15 +39,18 @@ def write_shard(
     Args:
         path: of the shard; a file that is there is replaced.
         episodes: for each its columns as the schema has them, (rows, ...) each; the same columns in all.
-        attrs: the attributes as Python values, without `schema`.
+        attrs: the attributes as Python values, `camera` as its `to_dict` gives it; without `schema`, and without what
+            follows from the camera (`K`, `world_T_camera`, `near`, `far`).
         ep_index: number of each episode in its run.
         ep_terminated: whether each episode ended in a terminal state; none did if not given.
 
     Raises:
         ValueError: a column is not what the schema says.
+        UsageError: an attribute is missing, or does not fit the columns.
     """
     for columns in episodes:
         _check(columns, episodes[0])
+    complete = complete_attributes(attrs, {name: values.shape[1:] for name, values in episodes[0].items()})
     lengths = np.array([len(columns["action"]) for columns in episodes], np.int64)
     tables = {
         "ep_len": lengths,
@@ -57,7 +61,7 @@ def write_shard(
     if any(ep_terminated):
         tables["ep_terminated"] = np.array(ep_terminated, np.uint8)
     with written_aside(path) as aside, h5py.File(aside, "w", libver=("v110", "v110")) as file:
-        for name, values in encode_attributes({"schema": SCHEMA_VERSION, **attrs}).items():
+        for name, values in encode_attributes(complete).items():
             file.attrs[name] = values
         for name, table in tables.items():
             file.create_dataset(name, data=table)

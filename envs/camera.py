@@ -127,18 +127,33 @@ class CameraModel:
         rotation, position = self.world_T_camera[:3, :3], self.world_T_camera[:3, 3]
         return (np.asarray(points, dtype=np.float64) - position) @ rotation
 
+    def to_dict(self) -> dict[str, Any]:
+        """The camera as numbers and lists that JSON can hold, exact to the last bit."""
+        return {
+            "width": self.width,
+            "height": self.height,
+            "K": self.K.tolist(),
+            "world_T_camera": self.world_T_camera.tolist(),
+            "near": self.near,
+            "far": self.far,
+        }
+
+    @classmethod
+    def from_dict(cls, fields: Any) -> CameraModel:
+        """The camera that `to_dict` gave.
+
+        Raises:
+            UsageError: it is no dict of a camera's fields.
+        """
+        names = {"width", "height", "K", "world_T_camera", "near", "far"}
+        if not isinstance(fields, dict) or set(fields) != names:
+            found = sorted(fields) if isinstance(fields, dict) else type(fields).__name__
+            raise UsageError(f"camera has {found}; it needs exactly {sorted(names)}, as to_dict and to_json give them")
+        return cls(**fields)
+
     def to_json(self) -> str:
         """The camera as one line of JSON, exact to the last bit."""
-        return json.dumps(
-            {
-                "width": self.width,
-                "height": self.height,
-                "K": self.K.tolist(),
-                "world_T_camera": self.world_T_camera.tolist(),
-                "near": self.near,
-                "far": self.far,
-            }
-        )
+        return json.dumps(self.to_dict())
 
     @classmethod
     def from_json(cls, text: str) -> CameraModel:
@@ -148,14 +163,10 @@ class CameraModel:
             UsageError: the text is no JSON object with a camera's fields.
         """
         try:
-            fields: Any = json.loads(text)
+            fields = json.loads(text)
         except (TypeError, ValueError) as error:
             raise UsageError(f"camera {str(text)[:60]!r} is not JSON ({error}); give what to_json wrote") from error
-        names = {"width", "height", "K", "world_T_camera", "near", "far"}
-        if not isinstance(fields, dict) or set(fields) != names:
-            found = sorted(fields) if isinstance(fields, dict) else type(fields).__name__
-            raise UsageError(f"camera JSON has {found}; it needs exactly {sorted(names)}, as to_json writes them")
-        return cls(**fields)
+        return cls.from_dict(fields)
 
 
 def _frozen_matrix(name: str, value: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:

@@ -11,7 +11,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import os
 import shutil
 from collections.abc import Callable
@@ -141,7 +140,7 @@ def _env_spec(dataset: RGBDDataset) -> gymnasium.envs.registration.EnvSpec | Non
 def _metadata(dataset: RGBDDataset, name: str, author: str | None, version: str) -> dict[str, Any]:
     ours = {key: dataset.attrs[key] for key in JSON_STRINGS if key not in REPEATED}
     ours |= {
-        "camera": json.loads(dataset.camera.to_json()),
+        "camera": dataset.camera.to_dict(),
         "control_rate": dataset.attrs["control_rate"],
         "content_hash": dataset.content_hash,
     }

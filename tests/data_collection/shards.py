@@ -1,7 +1,5 @@
 """Made-up episodes, and damage done to shards."""
 
-import json
-
 import h5py
 import numpy as np
 
@@ -15,11 +13,7 @@ ATTRS = {
     "policy": "random",
     "seed": 3,
     "control_rate": 10.0,
-    "K": CAMERA.K,
-    "world_T_camera": CAMERA.world_T_camera,
-    "near": CAMERA.near,
-    "far": CAMERA.far,
-    "camera": json.loads(CAMERA.to_json()),
+    "camera": CAMERA.to_dict(),
     "action_aggregation": ["sum", "last"],
     "action_scale": [0.1, 1.0],
     "body_names": ["world"],

@@ -118,11 +118,6 @@ def _empty(path):
     path.write_bytes(b"")
 
 
-def _drop_attribute(path):
-    with h5py.File(path, "a") as file:
-        del file.attrs["camera"]
-
-
 def _spoil_attribute(path):
     with h5py.File(path, "a") as file:
         file.attrs["env_id"] = "{"
@@ -153,7 +148,6 @@ def _retype_column(path):
         _truncate,
         _write_nonsense,
         _empty,
-        _drop_attribute,
         _spoil_attribute,
         _drop_table,
         _shorten_column,
@@ -188,9 +182,9 @@ def test_shards_of_different_datasets(folder, episodes):
     write_shard(folder / "shard-00001.h5", episodes[2:], {**ATTRS, "env_id": "other/Env-v0"}, [2])
     with pytest.raises(UsageError, match=r"shard-00001\.h5 has env_id = 'other/Env-v0'.*one dataset in a folder"):
         RGBDDataset(folder)
-    episodes[2]["action"] = episodes[2]["action"][:, :1]
+    episodes[2]["proprio"] = episodes[2]["proprio"][:, :1]
     write_shard(folder / "shard-00001.h5", episodes[2:], ATTRS, [2])
-    with pytest.raises(UsageError, match="column 'action' has rows of"):
+    with pytest.raises(UsageError, match="column 'proprio' has rows of"):
         RGBDDataset(folder)
 
 

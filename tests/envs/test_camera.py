@@ -76,6 +76,7 @@ def test_json_is_exact():
     back = CameraModel.from_json(camera.to_json())
     assert (back.width, back.height, back.near, back.far) == (64, 48, 0.1, 1 / 3)
     assert np.array_equal(back.K, camera.K) and np.array_equal(back.world_T_camera, camera.world_T_camera)
+    assert CameraModel.from_dict(camera.to_dict()).to_dict() == back.to_dict() == json.loads(camera.to_json())
 
 
 def test_matrices_are_read_only_copies():

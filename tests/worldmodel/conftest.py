@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -79,11 +78,7 @@ def write_squares(
         "policy": "random",
         "seed": seed,
         "control_rate": 30.0,
-        "K": camera.K,
-        "world_T_camera": camera.world_T_camera,
-        "near": camera.near,
-        "far": camera.far,
-        "camera": json.loads(camera.to_json()),
+        "camera": camera.to_dict(),
         "action_aggregation": list(AGGREGATION),
         "action_scale": list(SCALE),
         "body_names": ["world", "square"],
