@@ -126,11 +126,11 @@ def _check(name: str, model: WorldModel, dataset: RGBDDataset, options: Evaluati
 
 
 def _clip_sets(dataset: RGBDDataset, gaps: list[int], options: EvaluationOptions) -> dict[int, ValidationSet]:
-    """The clips for each frame gap; the pictures are held in memory once."""
+    """The clips for each frame gap, read from the disk as they are scored: a few of all that the data holds."""
     sets: dict[int, ValidationSet] = {}
     frames = options.context + options.predicted
     for gap in gaps:
-        source = ClipSource(dataset, gap, share=sets[gaps[0]].source if sets else None)
+        source = ClipSource(dataset, gap, memory_limit=0)
         sets[gap] = ValidationSet(source, options.clips, frames, options.context, options.batch)
         _count(sets[gap])  # now, not after the first model: are the episodes long enough?
     return sets

@@ -101,7 +101,7 @@ def main(options: ViewOptions) -> None:
     _check_fits(dataset, models, options)
     gap = next(iter(models.values())).frame_gap
     episode, start = _choose(dataset, gap, options)
-    source = ClipSource(dataset, gap, slice(episode, episode + 1))
+    source = ClipSource(dataset, gap, slice(episode, episode + 1), memory_limit=0)
     frames = options.context + options.predicted
     rows = np.array([dataset.episode_slices[episode, 0] + start])
     clips = source.at(rows, frames)
