@@ -111,7 +111,16 @@ class RGBDDataset:
     @property
     def action_dim(self) -> int:
         """Numbers in an action."""
-        return self._shards[0].columns["action"][0]
+        return self.width("action")
+
+    def width(self, column: str) -> int:
+        """Numbers in a row of a column that holds no pictures.
+
+        Raises:
+            UsageError: no such column.
+        """
+        self._require(column)
+        return self._shards[0].columns[column][0]
 
     @property
     def episode_slices(self) -> NDArray[np.int64]:

@@ -6,6 +6,7 @@ a model can get right in 3D by reaching the pixel, and which only by chance.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from matplotlib.figure import Figure
 from data_collection.files import written_aside
 from planning.episode import Record
 from planning.report import AXIS_BINS, TITLES, aligned, in_part, parting, parts_of
-from planning.statistics import Pairs
+from planning.statistics import Pairs, sign_flip_p
 
 REFERENCE = "t3vip"
 """Whom the others are compared with."""
@@ -43,7 +44,8 @@ def differences(records: Mapping[str, Sequence[Record]]) -> dict[str, dict[str, 
 
     Returns:
         rival -> part of the setups (all, and both parts) -> `servo.json`'s entry: the difference of the success rates
-        with Newcombe's 95 % interval, who alone succeeded how often, and the p-value of McNemar's exact test.
+        with Newcombe's 95 % interval, who alone succeeded how often, and the p-value of McNemar's exact test. Of both
+        the repeats of a setup are one observation.
     """
     if REFERENCE not in records:
         return {}
@@ -59,10 +61,13 @@ def _paired(ours: Sequence[Record], theirs: Sequence[Record], part: str) -> dict
     entry: dict[str, Any] = {"episodes": len(couples)}
     for space in SPACES:
         pairs = Pairs.count(*([record.reached(space) for record in side] for side in _unzip(couples)))
+        lead: Counter[int] = Counter()  # by setup
+        for a, b in couples:
+            lead[a.setup] += a.reached(space) - b.reached(space)
         entry[f"difference_{space}"] = pairs.difference
-        entry[f"difference_{space}_interval"] = list(pairs.interval())
+        entry[f"difference_{space}_interval"] = list(pairs.counting_as(len(lead)).interval())
         entry[f"only_{REFERENCE}_{space}"], entry[f"only_rival_{space}"] = pairs.first, pairs.second
-        entry[f"p_{space}"] = pairs.p_value()
+        entry[f"p_{space}"] = sign_flip_p(list(lead.values()))
     return entry
 
 

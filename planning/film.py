@@ -34,6 +34,11 @@ def film_path(folder: Path, record: Record) -> Path:
     return folder / f"{record.model}-setup{record.setup:02d}-{record.repeat}"
 
 
+def is_filmed(path: Path) -> bool:
+    """Whether `Film.save` has written both of its files there."""
+    return all(path.with_suffix(suffix).exists() for suffix in (".mp4", ".png"))
+
+
 class Studio:
     """The cameras that films are taken with; made once, for people only.
 

@@ -34,10 +34,13 @@ class EpisodeLog:
     def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._path = folder / EPISODES_NAME
-        self._agree(folder / CONFIG_NAME, json.loads(json.dumps(settings)))
         self.records: dict[EpisodeKey, Record] = {}
         if self._path.exists():
             self._read()
+        config, settings = folder / CONFIG_NAME, json.loads(json.dumps(settings))
+        if self.records and config.exists():
+            self._agree(config, settings)
+        write_json(config, settings)
 
     def append(self, record: Record) -> None:
         """Add a finished episode; it is on the disk when this returns."""
@@ -48,24 +51,26 @@ class EpisodeLog:
         self.records[record.model, record.setup, record.repeat] = record
 
     def _agree(self, path: Path, settings: dict[str, Any]) -> None:
-        """Models may be added to a folder; all else must stay, or the episodes could not be compared."""
-        if path.exists():
-            try:
-                before = json.loads(path.read_text())
-            except ValueError as error:
-                raise UsageError(f"{path} is no JSON ({error}); give another --out") from error
-            for key in sorted(before.keys() | settings.keys() - {"checkpoints"}):
-                if key != "checkpoints" and before.get(key) != settings.get(key):
-                    raise UsageError(
-                        f"{path.parent} holds episodes with {key} {before.get(key)!r}, not {settings.get(key)!r};"
-                        " give another --out, or the same options"
-                    )
-            for model, weights in before.get("checkpoints", {}).items():
-                if settings["checkpoints"].setdefault(model, weights) != weights:
-                    raise UsageError(
-                        f"{path.parent} holds episodes of another {model} checkpoint; give another --out, or that one"
-                    )
-        write_json(path, settings)
+        """Models may be added to a folder; all else must stay, or the episodes could not be compared.
+
+        The weights of the other models that the folder holds episodes of are taken over into the settings.
+        """
+        try:
+            before = json.loads(path.read_text())
+        except ValueError as error:
+            raise UsageError(f"{path} is no JSON ({error}); give another --out") from error
+        for key in sorted(before.keys() | settings.keys() - {"checkpoints"}):
+            if key != "checkpoints" and before.get(key) != settings.get(key):
+                raise UsageError(
+                    f"{path.parent} holds episodes with {key} {before.get(key)!r}, not {settings.get(key)!r};"
+                    " give another --out, or the same options"
+                )
+        held = {model for model, _, _ in self.records}
+        for model, weights in before.get("checkpoints", {}).items():
+            if model in held and settings["checkpoints"].setdefault(model, weights) != weights:
+                raise UsageError(
+                    f"{path.parent} holds episodes of another {model} checkpoint; give another --out, or that one"
+                )
 
     def _read(self) -> None:
         """Take in the finished episodes; a last line that a killed process left unfinished is cut off."""

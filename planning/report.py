@@ -37,7 +37,7 @@ def summarise(records: Sequence[Record]) -> dict[str, Any]:
     for space in ("2d", "3d"):
         hits = [record.reached(space) for record in records]
         summary[f"success_{space}"] = float(np.mean(hits))
-        summary[f"success_{space}_interval"] = list(wilson_interval(sum(hits), len(hits)))
+        summary[f"success_{space}_interval"] = _success_interval(records, space)
         summary[f"success_{space}_at"] = {
             str(limit): float(np.mean([record.success(limit, space) for record in records])) for limit in limits
         }
@@ -85,8 +85,15 @@ def _share(records: Sequence[Record]) -> dict[str, Any]:
     for space in ("2d", "3d"):
         hits = sum(record.reached(space) for record in records)
         part[f"success_{space}"] = hits / len(records) if records else None
-        part[f"success_{space}_interval"] = list(wilson_interval(hits, len(records)))
+        part[f"success_{space}_interval"] = _success_interval(records, space)
     return part
+
+
+def _success_interval(records: Sequence[Record], space: str) -> list[float]:
+    """Wilson's, in which all episodes of a setup are one observation."""
+    setups = len({record.setup for record in records})
+    hits = sum(record.reached(space) for record in records)
+    return list(wilson_interval(hits * setups / max(len(records), 1), setups))
 
 
 def table(models: dict[str, dict[str, Any]]) -> str:

@@ -19,7 +19,7 @@ from envs.errors import UsageError
 from planning.comparison import comparison_chart, difference_table, differences
 from planning.controllers import CONTROLLERS, LEARNED, PIXEL_MODELS, Kit
 from planning.episode import Record, mark_of, run_episode
-from planning.film import Film, Studio, film_path
+from planning.film import Film, Studio, film_path, is_filmed
 from planning.filmstrip import filmstrip
 from planning.icem import ICEMConfig
 from planning.records import EpisodeLog
@@ -72,7 +72,7 @@ class ServoConfig:
     deadline: float | None = None
     """seconds after which a plan must be there"""
     video: int = 0
-    """episodes per model to film; with t3vip and a pixel model among them also a film strip of both"""
+    """episodes per model to film, finished ones too; with t3vip and a pixel model also a film strip of both"""
     device: str = "cpu"
     """where world models run, e.g. cpu or cuda"""
 
@@ -187,12 +187,15 @@ def weights_hash(model: Any) -> str:
 
 
 def run_missing(config: ServoConfig, env: gym.Env, studio: Studio, kit: Kit, log: EpisodeLog) -> Iterator[Record]:
-    """The episodes that the log does not hold yet, setup by setup, all models on the same one."""
+    """The episodes that the log does not hold yet, setup by setup, all models on the same one.
+
+    Those that it holds without the film that is asked for are run again for it, and are not given.
+    """
     todo = [
         (setup, repeat, name)
         for setup, repeat in config.attempts()
         for name in config.model
-        if (name, setup, repeat) not in log.records
+        if (name, setup, repeat) not in log.records or lacks_film(config, log.records[name, setup, repeat])
     ]
     done = len(config.model) * len(config.attempts()) - len(todo)
     setup: Setup | None = None
@@ -203,15 +206,25 @@ def run_missing(config: ServoConfig, env: gym.Env, studio: Studio, kit: Kit, log
                 kit.mark = mark_of(setup)
             entropy = (EPISODE_ENTROPY, config.seed, index, repeat)
             kit.rng = np.random.default_rng(np.random.SeedSequence(entropy))
-            filmed = index * config.repeats + repeat < config.video
-            film = Film(studio, setup, name) if filmed else None
+            film = Film(studio, setup, name) if wants_film(config, index, repeat) else None
             record = run_episode(
                 env, setup, CONTROLLERS[name](kit), config.steps, repeat, film.watch if film is not None else None
             )
             if film is not None:
                 film.save(film_path(config.out / "videos", record))
             progress.set_postfix_str(f"{name}: {100 * record.final_distance:.1f} cm left")
-            yield record
+            if (name, index, repeat) not in log.records:
+                yield record
+
+
+def wants_film(config: ServoConfig, setup: int, repeat: int) -> bool:
+    """Whether an episode is one of the first that are to be filmed."""
+    return setup * config.repeats + repeat < config.video
+
+
+def lacks_film(config: ServoConfig, record: Record) -> bool:
+    """Whether a finished episode is to be filmed and is not."""
+    return wants_film(config, record.setup, record.repeat) and not is_filmed(film_path(config.out / "videos", record))
 
 
 def report(config: ServoConfig, log: EpisodeLog) -> None:

@@ -1,18 +1,23 @@
-"""What a handful of episodes says about a success rate, and about the difference of two."""
+"""What a handful of episodes says about a success rate, and about the difference of two.
+
+Episodes of one setup resemble each other, and those of a controller without randomness are the same. So a setup is one
+observation, however often it is repeated: with `n` setups and `N` episodes, an episode counts as n / N of one.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from scipy.stats import binomtest
+import numpy as np
 
 
-def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+def wilson_interval(successes: float, trials: float, z: float = 1.959964) -> tuple[float, float]:
     """Wilson's score interval of a proportion (1927), which stays honest near 0 and 1.
 
     Args:
-        successes: of `trials`.
+        successes: of `trials`; a trial may succeed in part.
         trials: independent attempts.
         z: quantile of the normal distribution; 1.96 gives 95 %.
 
@@ -32,12 +37,12 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
 class Pairs:
     """How two competitors fared at the same tasks, counted by who succeeded."""
 
-    both: int
-    first: int
+    both: float
+    first: float
     """the first alone"""
-    second: int
+    second: float
     """the second alone"""
-    neither: int
+    neither: float
 
     @classmethod
     def count(cls, first: list[bool], second: list[bool]) -> Pairs:
@@ -46,9 +51,14 @@ class Pairs:
         return cls(*(pairs.count(who) for who in ((True, True), (True, False), (False, True), (False, False))))
 
     @property
-    def total(self) -> int:
+    def total(self) -> float:
         """Tasks."""
         return self.both + self.first + self.second + self.neither
+
+    def counting_as(self, tasks: int) -> Pairs:
+        """The same shares of fewer tasks, where some are the same again."""
+        counts = (self.both, self.first, self.second, self.neither)
+        return Pairs(*(tasks * count / self.total for count in counts)) if self.total else self
 
     @property
     def difference(self) -> float | None:
@@ -89,13 +99,30 @@ class Pairs:
             together = max(together - self.total / 2, 0.0)
         return together / math.sqrt(spread)
 
-    def p_value(self) -> float:
-        """McNemar's exact test (two-sided) that neither is the better one; 1 if they never differ."""
-        differ = self.first + self.second
-        return float(binomtest(self.first, differ).pvalue) if differ else 1.0
+
+def sign_flip_p(differences: Sequence[int]) -> float:
+    """Exact two-sided p-value that neither of two competitors is the better one.
+
+    If neither is, each difference might as well have the other sign: the value is the share of all ways to choose the
+    signs in which the sum is at least as far from 0 as it is. Of differences -1, 0 and 1 this is McNemar's exact test.
+
+    Args:
+        differences: by task, the first's successes less the second's.
+
+    Returns:
+        In (0, 1]; 1 if they never differ.
+    """
+    chances = np.ones(1)  # of each sum, from the least that can be to the greatest
+    for size in map(abs, differences):
+        either = np.zeros(2 * size + 1)
+        either[0] += 0.5
+        either[-1] += 0.5
+        chances = np.convolve(chances, either)
+    sums = np.arange(len(chances)) - len(chances) // 2
+    return min(1.0, float(chances[np.abs(sums) >= abs(sum(differences))].sum()))
 
 
-def _reach(successes: int, trials: int, z: float) -> tuple[float, float]:
+def _reach(successes: float, trials: float, z: float) -> tuple[float, float]:
     """How far Wilson's interval reaches down and up from the share itself."""
     low, high = wilson_interval(successes, trials, z)
     return successes / trials - low, high - successes / trials

@@ -75,7 +75,7 @@ def save_model(
     """Save weights and config for `load_model`.
 
     Args:
-        origin: where the model came from (options, seed, data hashes, scores), kept in the config for people.
+        origin: where the model came from (options, seed, data hashes, scores), for people and `load_origin`.
         inference: of a model with latents, for `load_inference`; prediction does without it.
     """
     document = {
@@ -166,6 +166,16 @@ def load_inference(name: str | Path, model: WorldModel) -> InferenceNetwork | No
         reason = str(error).splitlines()[0]
         raise UsageError(f"{path} cannot be read ({reason}); remove it, or restore the folder") from error
     return network.to(model.device).eval()
+
+
+def load_origin(name: str | Path) -> dict[str, Any]:
+    """Where a model came from, as `save_model` was told.
+
+    Args:
+        name: see `find_model`.
+    """
+    origin: dict[str, Any] = json.loads((find_model(name) / CONFIG).read_text()).get("origin", {})
+    return origin
 
 
 def save_training(

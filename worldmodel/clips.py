@@ -65,6 +65,18 @@ class ClipTruth:
     """(B, T, 3) metres, camera frame; None where proprioception is not that of an arm, `robot_obs` of CALVIN."""
 
 
+def action_units(dataset: RGBDDataset, action_column: str) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    """How each number of an action adds up over a frame gap, and how many metres or radians 1 stands for in it.
+
+    Raises:
+        UsageError: no such column.
+    """
+    if action_column == "action":
+        return tuple(dataset.attrs["action_aggregation"]), tuple(float(unit) for unit in dataset.attrs["action_scale"])
+    joints = dataset.width(action_column)
+    return ("sum",) * joints, (1.0,) * joints
+
+
 class ClipSource:
     """Random clips of a dataset, the same for the same seed and step, with no state to save.
 
@@ -99,11 +111,7 @@ class ClipSource:
             self.in_memory = share.in_memory
         self._hold((action_column, *HELD) if self.in_memory else (action_column,))
         self.action_dim = int(self._columns[action_column].shape[1])
-        self.action_aggregation: tuple[str, ...] = ("sum",) * self.action_dim  # of joint deltas, in radians
-        self.action_scale: tuple[float, ...] = (1.0,) * self.action_dim
-        if action_column == "action":
-            self.action_aggregation = tuple(dataset.attrs["action_aggregation"])
-            self.action_scale = tuple(float(unit) for unit in dataset.attrs["action_scale"])
+        self.action_aggregation, self.action_scale = action_units(dataset, action_column)
 
     def starts(self, frames: int) -> NDArray[np.int64]:
         """First rows of all clips of `frames` frames."""

@@ -13,10 +13,11 @@ from data_collection.files import write_json, written_aside
 from envs import command as command_line
 from envs.errors import UsageError
 from worldmodel import evaluation_report as report
-from worldmodel.checkpoint import load_inference, load_model
+from worldmodel.checkpoint import load_inference, load_model, load_origin
 from worldmodel.clips import ClipSource
 from worldmodel.devices import best_precision, find_device
 from worldmodel.evaluation_table import EvaluationTable
+from worldmodel.interface import check_fits
 from worldmodel.measurement import Networks, Sampling, measure_copy, measure_model
 from worldmodel.memory import keep_freed_memory
 from worldmodel.perceptual import SMALLEST, PerceptualNetwork
@@ -84,8 +85,9 @@ def main(options: EvaluationOptions) -> None:
     keep_freed_memory()
     dataset = RGBDDataset(options.data)
     models = {name: load_model(name, options.device) for name in options.models}
-    for name, model in models.items():
-        _check(name, model, dataset, options)
+    remarks = [note for name, model in models.items() for note in _remarks(name, model, dataset)]
+    for note in remarks:
+        print(note)
     gaps = {name: options.frame_gap or model.frame_gap for name, model in models.items()}
     sets = _clip_sets(dataset, sorted(set(gaps.values())), options)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -93,7 +95,7 @@ def main(options: EvaluationOptions) -> None:
     select: Selection = options.select if networks is not None else "psnr"
     sampling = Sampling(options.samples, select, options.seed) if options.samples else None
     table = EvaluationTable(sets, sampling, options.seed)
-    document = _document(options, dataset, sets, select, notes)
+    document = _document(options, dataset, sets, select, remarks + notes)
     with tqdm(total=sum(map(_count, [*sets.values(), *(sets[gap] for gap in gaps.values())])), unit="clip") as bar:
         for gap, data in sets.items():
             bar.set_description("copy")
@@ -112,25 +114,20 @@ def main(options: EvaluationOptions) -> None:
         print(options.out / file)
 
 
-def _check(name: str, model: WorldModel, dataset: RGBDDataset, options: EvaluationOptions) -> None:
-    if (model.camera.height, model.camera.width) != (dataset.camera.height, dataset.camera.width):
-        raise UsageError(
-            f"{name} wants pictures of {model.camera.height}x{model.camera.width}, {options.data} has "
-            f"{dataset.camera.height}x{dataset.camera.width}; collect with another --image-size"
-        )
-    if model.context.action_column == "action" and model.context.action_dim != dataset.action_dim:
-        raise UsageError(
-            f"{name} takes actions of {model.context.action_dim} numbers, {options.data} has {dataset.action_dim}; "
-            "evaluate on data of the environment it was trained in"
-        )
+def _remarks(name: str, model: WorldModel, dataset: RGBDDataset) -> list[str]:
+    """What the reader of the report must know about this model on this data."""
+    notes = check_fits(name, model, dataset)
+    if load_origin(name).get("data", {}).get("train") == dataset.content_hash:
+        notes.append(f"{name} was trained on this data: its scores say nothing about data that it has not seen")
+    return notes
 
 
 def _clip_sets(dataset: RGBDDataset, gaps: list[int], options: EvaluationOptions) -> dict[int, ValidationSet]:
-    """The clips for each frame gap; the pictures are held in memory once."""
+    """The clips for each frame gap, read from the disk as they are scored: a few of all that the data holds."""
     sets: dict[int, ValidationSet] = {}
     frames = options.context + options.predicted
     for gap in gaps:
-        source = ClipSource(dataset, gap, share=sets[gaps[0]].source if sets else None)
+        source = ClipSource(dataset, gap, memory_limit=0)
         sets[gap] = ValidationSet(source, options.clips, frames, options.context, options.batch)
         _count(sets[gap])  # now, not after the first model: are the episodes long enough?
     return sets

@@ -7,6 +7,7 @@ from envs.errors import UsageError
 from envs.planar_push.objects import SPLITS, canonical
 from worldmodel.clips import HELD, ClipSource
 from worldmodel.config import ModelContext
+from worldmodel.interface import Interface, mismatch
 from worldmodel.memory import available_memory
 from worldmodel.options import TrainOptions
 from worldmodel.ranks import processes_here
@@ -41,7 +42,7 @@ def open_data(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
     limit = _memory_limit(options)
     if options.validation is not None:
         held_out = RGBDDataset(options.validation)
-        _same_world(dataset, held_out)
+        _same_world(dataset, held_out, options.action_column)
         train = ClipSource(dataset, options.frame_gap, action_column=options.action_column, memory_limit=limit)
         limit -= dataset.size_of(HELD) if train.in_memory else 0
         other = ClipSource(held_out, options.frame_gap, action_column=options.action_column, memory_limit=limit)
@@ -76,14 +77,10 @@ def _has_test_objects(dataset: RGBDDataset) -> bool:
     return kwargs.get("split") in TEST_SPLITS or (one is not None and canonical(one) in SPLITS["test"])
 
 
-def _same_world(train: RGBDDataset, other: RGBDDataset) -> None:
-    for name, ours, theirs in (
-        ("action size", train.action_dim, other.action_dim),
-        ("image size", (train.camera.height, train.camera.width), (other.camera.height, other.camera.width)),
-        ("depth range", (train.camera.near, train.camera.far), (other.camera.near, other.camera.far)),
-    ):
-        if ours != theirs:
-            raise UsageError(f"{other.path} has {name} {theirs}, {train.path} has {ours}; validate on data of one kind")
+def _same_world(train: RGBDDataset, other: RGBDDataset, action_column: str) -> None:
+    difference = mismatch(Interface.of_data(other, action_column), Interface.of_data(train, action_column))
+    if difference is not None:
+        raise UsageError(f"{other.path} has {difference} as {train.path}; validate on data of one kind")
 
 
 def model_context(train: ClipSource, options: TrainOptions) -> ModelContext:

@@ -17,6 +17,7 @@ from envs.errors import UsageError
 from worldmodel.checkpoint import PRETRAINED, find_model, load_model, shipped_models
 from worldmodel.clips import ClipSource
 from worldmodel.figure import Storyboard, write_film, write_sheet
+from worldmodel.interface import check_fits
 from worldmodel.pictures import predict, storyboard
 from worldmodel.viewer3d import Scene, require_rerun, view_scene, write_scene
 from worldmodel.world_model import WorldModel
@@ -98,10 +99,13 @@ def main(options: ViewOptions) -> None:
         require_rerun(options.view)
     dataset = RGBDDataset(options.data)
     models = {name: load_model(name, options.device) for name in options.models}
-    _check_fits(dataset, models, options)
+    for name, model in models.items():
+        for note in check_fits(name, model, dataset):
+            print(note)
+    _check_together(models, options)
     gap = next(iter(models.values())).frame_gap
     episode, start = _choose(dataset, gap, options)
-    source = ClipSource(dataset, gap, slice(episode, episode + 1))
+    source = ClipSource(dataset, gap, slice(episode, episode + 1), memory_limit=0)
     frames = options.context + options.predicted
     rows = np.array([dataset.episode_slices[episode, 0] + start])
     clips = source.at(rows, frames)
@@ -202,17 +206,7 @@ def _liveliest(rgb: NDArray[np.uint8], span: int) -> int:
     )
 
 
-def _check_fits(dataset: RGBDDataset, models: dict[str, WorldModel], options: ViewOptions) -> None:
-    for name, model in models.items():
-        commanded = model.context.action_column == "action"
-        for what, ours, theirs in (
-            ("action size", model.context.action_dim, dataset.action_dim if commanded else model.context.action_dim),
-            ("image size", (model.camera.height, model.camera.width), (dataset.camera.height, dataset.camera.width)),
-        ):
-            if ours != theirs:
-                raise UsageError(
-                    f"{options.data} has {what} {theirs}, the model {name} wants {ours}; give data of its kind"
-                )
+def _check_together(models: dict[str, WorldModel], options: ViewOptions) -> None:
     gaps = {name: model.frame_gap for name, model in models.items()}
     if len(set(gaps.values())) > 1:
         listed = ", ".join(f"{name} {gap}" for name, gap in gaps.items())

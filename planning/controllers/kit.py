@@ -18,6 +18,7 @@ from planning.icem import ICEM, ICEMConfig
 from planning.marks import Mark
 from planning.what_if import WhatIf, what_if
 from worldmodel import checkpoint
+from worldmodel.interface import Interface, mismatch
 
 FAMILIES = {"t3vip/Tabletop": "", "t3vip/PlanarPush": "planar-push/"}
 """Environments of one kind, by how their ids begin, and before the names of the models that are shipped for them."""
@@ -112,10 +113,14 @@ def _check_fits(name: str, model: Any, env: gym.Env) -> None:
     family = _family(env_id)
     if family not in trained:
         raise UsageError(f"the {name} checkpoint was trained in {trained}, not in {env_id}; give one of a {family}")
-    camera: CameraModel = env.unwrapped.camera  # type: ignore[attr-defined]
-    size, wanted = (camera.width, camera.height), (model.camera.width, model.camera.height)
-    if size != wanted:
-        raise UsageError(f"the {name} checkpoint wants {wanted} images, {env_id} gives {size}; set image-size")
+    inner: Any = env.unwrapped
+    here = Interface(env_id, inner.camera, inner.ACTION_AGGREGATION, tuple(inner.ACTION_SCALE), inner.control_rate)
+    difference = mismatch(here, Interface.of_model(model))
+    if difference is not None:
+        raise UsageError(
+            f"{env_id} has {difference}, which the {name} checkpoint was trained on; give another checkpoint"
+            " or, for the image size, --image-size"
+        )
     if model.action_dim != env.action_space.shape[0]:  # type: ignore[index]
         raise UsageError(
             f"the {name} checkpoint takes actions of {model.action_dim} numbers, {env_id} of"

@@ -35,7 +35,11 @@ class ExactModel:
 
     def __post_init__(self) -> None:
         self.context = SimpleNamespace(
-            env_id="t3vip/TabletopC-v0", action_aggregation=AGGREGATION, action_scale=SCALE, frame_gap=self.frame_gap
+            env_id="t3vip/TabletopC-v0",
+            action_aggregation=AGGREGATION,
+            action_scale=SCALE,
+            frame_gap=self.frame_gap,
+            control_rate=30.0,
         )
 
     def parameters(self) -> Any:

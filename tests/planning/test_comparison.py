@@ -1,6 +1,7 @@
 """Models against each other, from records made by hand."""
 
 import json
+from dataclasses import replace
 
 import imageio.v3 as iio
 import numpy as np
@@ -58,6 +59,26 @@ def test_differences_are_paired_and_split_by_direction(fleet):
     assert -1 <= low < 1 and high == 1  # of two pairs that fell out alike: no certainty
     assert entry["all"]["difference_2d"] == 0 and entry["all"]["p_2d"] == 1
     assert differences({"sv2p": fleet["sv2p"], "random": fleet["random"]}) == {}
+
+
+def test_the_same_episodes_again_make_nothing_surer(fleet):
+    """Repeats of controllers without randomness."""
+    again = {
+        name: [replace(record, repeat=repeat) for record in of_model for repeat in range(5)]
+        for name, of_model in fleet.items()
+    }
+    once, often = differences(fleet)["sv2p"], differences(again)["sv2p"]
+    for part, entry in often.items():
+        for key in ("episodes", "only_t3vip_3d"):
+            assert entry[key] == 5 * once[part][key]
+        for key in ("difference_3d", "difference_3d_interval", "p_3d", "difference_2d_interval", "p_2d"):
+            assert entry[key] == pytest.approx(once[part][key]), key
+    once, often = summarise(fleet["sv2p"]), summarise(again["sv2p"])
+    assert (often["episodes"], often["setups"], once["setups"]) == (20, 4, 4)
+    for key in ("success_3d", "success_3d_interval", "success_2d_interval"):
+        assert often[key] == pytest.approx(once[key])
+        for part in ("across", "along"):
+            assert often["by_axis_share"][part][key] == pytest.approx(once["by_axis_share"][part][key])
 
 
 def test_a_part_without_setups_says_nothing(fleet):

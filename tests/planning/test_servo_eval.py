@@ -172,17 +172,28 @@ def test_models_of_different_frame_gaps_are_refused(env, tmp_path, make_exact_mo
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("wrong", ["env", "size", "action", "kind"])
+@pytest.mark.parametrize("wrong", ["env", "size", "lens", "action", "units", "kind"])
 def test_a_checkpoint_that_does_not_fit_is_refused(env, tmp_path, make_exact_model, monkeypatch, wrong):
     camera = env.unwrapped.camera
     if wrong == "size":
         camera = type(camera).from_fovy(48, 48, 10, np.eye(4), 3, 5)
+    if wrong == "lens":
+        camera = type(camera).from_fovy(64, 64, 40, np.eye(4), camera.near, camera.far)
     model = make_exact_model(camera, action_dim=3 if wrong == "action" else 7)
+    if wrong == "units":
+        model.context.action_scale = (0.01, *model.context.action_scale[1:])
     if wrong == "kind":
         model.kind = "sv2p"
     if wrong == "env":
         model.context.env_id = "t3vip/DexHand-v0"
     monkeypatch.setattr(checkpoint, "load_model", lambda name, device: model)
-    words = {"env": "DexHand", "size": "48", "action": "3 numbers", "kind": "is a sv2p"}
+    words = {
+        "env": "DexHand",
+        "size": r"image size \(64, 64\), not \(48, 48\)",
+        "lens": "intrinsics",
+        "action": "3 numbers",
+        "units": "action scale",
+        "kind": "is a sv2p",
+    }
     with pytest.raises(UsageError, match=words[wrong]):
         main(ServoConfig(out=tmp_path, model=("t3vip",), episodes=1))

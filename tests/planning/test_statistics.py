@@ -1,10 +1,12 @@
 """Intervals against published values (and scipy's)."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from planning.statistics import Pairs, wilson_interval
+from planning.statistics import Pairs, sign_flip_p, wilson_interval
 
 
 @pytest.mark.parametrize(
@@ -49,8 +51,36 @@ def test_all_pairs_alike_still_leave_doubt():
 
 
 def test_mcnemar():
-    assert Pairs(20, 12, 2, 16).p_value() == pytest.approx(0.0129, abs=1e-4)  # Armitage and Berry (1994)
-    assert Pairs(5, 0, 0, 5).p_value() == 1
+    assert sign_flip_p([0] * 36 + [1] * 12 + [-1] * 2) == pytest.approx(0.0129, abs=1e-4)  # Armitage and Berry (1994)
+    assert sign_flip_p([0] * 10) == sign_flip_p([]) == 1
+    for first, second in itertools.product(range(8), range(8)):
+        if first + second:
+            theirs = binomtest(first, first + second).pvalue
+            assert sign_flip_p([1] * first + [-1] * second) == pytest.approx(theirs, abs=1e-12)
+
+
+def test_signs_are_flipped_setup_by_setup():
+    differences = [3, -1, 2, 0, 5, 1, -2]
+    sums = [np.dot(signs, differences) for signs in itertools.product((-1, 1), repeat=len(differences))]
+    assert sign_flip_p(differences) == pytest.approx(np.mean(np.abs(sums) >= sum(differences)))
+    assert sign_flip_p([5, 5, 5, 0, 0]) == pytest.approx(0.25) == sign_flip_p([1, 1, 1, 0, 0])
+
+
+def test_pairs_that_are_the_same_again_add_nothing():
+    once, often = Pairs(5, 3, 0, 2), Pairs(25, 15, 0, 10)
+    assert often.difference == once.difference and often.counting_as(10) == once
+    assert often.counting_as(10).interval() == once.interval()
+    assert Pairs(0, 0, 0, 0).counting_as(0).interval() == (-1, 1)
+
+
+def test_intervals_cover_as_often_as_they_say_however_alike_repeats_are():
+    rng = np.random.default_rng(0)
+    setups, repeats = 20, 5
+    for sharpness in (0.1, 1.0, 100.0):  # of how easy setups are: all or nothing, anything, alike
+        easy = rng.beta(0.7 * sharpness, 0.3 * sharpness, (1000, setups))
+        shares = rng.binomial(repeats, easy).sum(1) / repeats
+        intervals = [wilson_interval(share, setups) for share in shares]
+        assert np.mean([low <= 0.7 <= high for low, high in intervals]) >= 0.93
 
 
 def test_pairs_are_counted_task_by_task():

@@ -13,7 +13,9 @@ from data_collection import dataset as dataset_module
 from data_collection import writer
 from data_collection.dataset import NEARBY_ROWS, RGBDDataset
 from envs.errors import UsageError
-from worldmodel.clips import ClipSource
+from worldmodel import evaluate, view_prediction
+from worldmodel.checkpoint import save_model
+from worldmodel.clips import PICTURES, ClipSource
 from worldmodel.memory import available_memory
 from worldmodel.train import main, parse_options
 
@@ -128,6 +130,16 @@ def test_training_has_the_same_bits_from_the_disk_and_when_it_must(folder, tmp_p
     for name, value in held.items():
         assert torch.equal(value, read[name]), name
     main(parse_options([*given, "--out", str(tmp_path / "disk")]))  # it would go on without the limit
+
+
+def test_scoring_and_viewing_hold_no_pictures(folder, make_model, tmp_path, monkeypatch):
+    loaded, load = [], RGBDDataset.load
+    monkeypatch.setattr(RGBDDataset, "load", lambda self, column: loaded.append(column) or load(self, column))
+    save_model(make_model(), tmp_path / "model", {})
+    given = {"data": folder, "models": (str(tmp_path / "model"),), "predicted": 2}
+    evaluate.main(evaluate.EvaluationOptions(out=tmp_path / "scores", clips=3, vgg=False, **given))
+    view_prediction.main(view_prediction.ViewOptions(out=(tmp_path / "clip.png",), **given))
+    assert "action" in loaded and not set(PICTURES) & set(loaded)
 
 
 def test_a_limit_that_is_none():

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from data_collection.dataset import RGBDDataset
 from envs.command import run
 from worldmodel import evaluate as command
 from worldmodel.checkpoint import save_model
@@ -114,15 +115,28 @@ def test_without_the_weights_everything_else_is_scored(evaluate, model_folder, m
     assert "VGG scores are left out: there is no network" in capsys.readouterr().out
 
 
+def test_the_report_says_that_a_model_was_trained_on_the_data(evaluate, make_model, tiny_dataset, tmp_path):
+    model, name = make_model(), str(tmp_path / "seen")
+    model.context = replace(model.context, control_rate=10.0)
+    save_model(model, tmp_path / "seen", {"data": {"train": RGBDDataset(tiny_dataset).content_hash}})
+    rate, seen = evaluate(name)["protocol"]["notes"][:-1]  # the last is about VGG
+    assert rate.endswith("was trained on 10") and seen.startswith(f"{name} was trained on this data")
+    report = (tmp_path / "out" / "evaluation.md").read_text()
+    assert rate in report and seen in report
+
+
 def test_mistakes_are_one_line(evaluate, model_folder, make_model, write_dataset, camera_of, tmp_path, capsys):
     model = make_model()
-    fewer = {"action_dim": 5, "action_mean": (0.0,) * 5, "action_std": (1.0,) * 5}
+    fewer = {"action_aggregation": ("sum",) * 5, "action_scale": (1.0,) * 5}
+    fewer |= {"action_dim": 5, "action_mean": (0.0,) * 5, "action_std": (1.0,) * 5}
     save_model(T3VIP(model.config, replace(model.context, **fewer)), tmp_path / "other", {})
     wide = write_dataset(tmp_path / "wide", [16], camera_of(32, 16))
+    near = write_dataset(tmp_path / "near", [16], camera_of(near=0.1, far=1.0))
     for call, words in (
         (lambda: evaluate("/nowhere"), "no model at '/nowhere'"),
-        (lambda: evaluate(model_folder, tmp_path / "other"), "takes actions of 5 numbers"),
-        (lambda: evaluate(model_folder, data=wide), "wants pictures of 16x24"),
+        (lambda: evaluate(model_folder, tmp_path / "other"), "has action size 7, not 5"),
+        (lambda: evaluate(model_folder, data=wide), "image size (16, 32), not (16, 24)"),
+        (lambda: evaluate(model_folder, data=near), "depth range (0.1, 1.0), not (1.0, 3.0)"),
         (lambda: evaluate(model_folder, data=tmp_path / "nothing"), "no dataset folder"),
         (lambda: evaluate(model_folder, arguments=["--device", "abacus"]), "device 'abacus'"),
         (lambda: evaluate(model_folder, arguments=["--predicted", "0"]), "predicted is 0"),

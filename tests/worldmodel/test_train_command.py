@@ -157,6 +157,8 @@ def test_data_that_does_not_do(train, write_dataset, camera_of, tmp_path):
     for other, word in ((camera_of(32, 16), "image size (16, 32)"), (camera_of(far=4.0), "depth range (1.0, 4.0)")):
         folder = write_dataset(tmp_path / f"other{other.width}", [12], other)
         assert_one_line(train("--validation", folder), str(folder), word)
+    finer = write_dataset(tmp_path / "finer", [12], action_scale=[0.01] * 7)
+    assert_one_line(train("--validation", finer), str(finer), "action scale (0.01,")
     short = write_dataset(tmp_path / "short", [6])
     assert_one_line(train("--validation", short), "no episode is 10 frames long", "longest has 6")
     assert not (tmp_path / "run" / "metrics.jsonl").exists()
