@@ -166,7 +166,7 @@ def test_mistakes_are_one_line(tmp_path, run, options, word):
 
 def test_models_of_different_frame_gaps_are_refused(env, tmp_path, make_exact_model, make_pixel_model, monkeypatch):
     make = {"t3vip": make_exact_model, "sv2p": make_pixel_model}  # gaps of 3 and 1
-    monkeypatch.setattr(checkpoint, "load_model", lambda name, device: make[name](env.unwrapped.camera))
+    monkeypatch.setattr(checkpoint, "load_model", lambda path, device: make[path.name](env.unwrapped.camera))
     with pytest.raises(UsageError, match=r"t3vip 3, sv2p 1.*one frame gap"):
         main(ServoConfig(out=tmp_path, model=("t3vip", "sv2p"), episodes=1))
     assert not list(tmp_path.iterdir())
