@@ -60,7 +60,8 @@ def _repair_shard(path: Path) -> list[str]:
     kept = [number for number, whole in enumerate(intact) if whole]
     episodes = [read_episode(shard, number) for number in kept]
     attrs = {name: value for name, value in shard.attrs.items() if name not in ("schema", *FROM_CAMERA)}
-    complete_attributes(attrs, shard.columns)  # what cannot be written again is not moved
+    if kept:
+        complete_attributes(attrs, shard.columns)  # what cannot be written again is not moved
     aside = _move_aside(path)
     if kept:
         ended = [bool(shard.ep_terminated[number]) for number in kept]

@@ -109,7 +109,8 @@ def test_shipped_models_are_those_of_the_environment(push, table, monkeypatch):
     for env, given in ((push, {}), (table, {}), (push, {"t3vip": "mine"})):
         with pytest.raises(KeyError):
             Kit(env, checkpoints=given).model("t3vip")
-    assert asked == ["planar-push/t3vip", "t3vip", "mine"]
+    shipped = checkpoint.PRETRAINED
+    assert asked == [shipped / "planar-push/t3vip", shipped / "t3vip", "mine"]
 
 
 def run(monkeypatch, *arguments):
