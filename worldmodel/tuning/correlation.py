@@ -39,5 +39,10 @@ def rank_correlations(trials: Sequence[Trial], budgets: Sequence[int]) -> list[d
     return pairs
 
 
+def written(p: float) -> str:
+    """A p-value for people: none is 0."""
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
 def _number(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None

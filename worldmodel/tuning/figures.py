@@ -11,6 +11,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from data_collection.files import written_aside
+from worldmodel.tuning.correlation import written
 
 Document = dict[str, Any]
 _GREY = "0.75"
@@ -30,7 +31,9 @@ def draw_correlations(document: Document, path: Path) -> None:
             text, dark = f"n = {pair['n']}", False
         else:
             values[row, column] = pair["r"]
-            text, dark = f"r = {pair['r']:.3f}\np = {pair['p']:.3f}\nn = {pair['n']}", pair["r"] > 0.6
+            p = written(pair["p"])
+            p = p if p.startswith("<") else f"= {p}"
+            text, dark = f"r = {pair['r']:.3f}\np {p}\nn = {pair['n']}", pair["r"] > 0.6
         axes.text(column, row, text, ha="center", va="center", fontsize=8, color="white" if dark else "black")
     image = axes.imshow(values, vmin=-1, vmax=1, cmap="PuOr")
     axes.set_xticks(range(size - 1), [str(budget) for budget in budgets[1:]])

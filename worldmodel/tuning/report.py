@@ -9,7 +9,7 @@ from typing import Any
 from data_collection.files import write_json, written_aside
 from envs.errors import UsageError
 from worldmodel.tuning import journal
-from worldmodel.tuning.correlation import FEWEST, rank_correlations
+from worldmodel.tuning.correlation import FEWEST, rank_correlations, written
 from worldmodel.tuning.figures import draw_correlations, draw_trials
 from worldmodel.tuning.journal import Trial
 from worldmodel.tuning.search import SETTINGS
@@ -135,10 +135,7 @@ def markdown(document: Document) -> str:
             lines += ["", f"Spearman rank correlation between budgets, {which}:", ""]
             lines += _table(
                 ["budgets", "r", "p", "n"],
-                [
-                    [" and ".join(map(str, pair["budgets"])), *(_digits(pair[name]) for name in "rp"), str(pair["n"])]
-                    for pair in pairs
-                ],
+                [[" and ".join(map(str, pair["budgets"])), *_correlation(pair), str(pair["n"])] for pair in pairs],
             )
     return "\n".join(lines) + "\n"
 
@@ -151,5 +148,6 @@ def _decibels(value: float | None) -> str:
     return "" if value is None else f"{value:.2f}"
 
 
-def _digits(value: float | None) -> str:
-    return "" if value is None else f"{value:.3f}"
+def _correlation(pair: dict[str, Any]) -> list[str]:
+    """r and p, empty where there is none."""
+    return ["", ""] if pair["r"] is None else [f"{pair['r']:.3f}", written(pair["p"])]
