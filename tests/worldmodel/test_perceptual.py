@@ -46,7 +46,7 @@ def referee(monkeypatch, weights):
     return network
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def test_lpips_is_that_of_torchmetrics(random_vgg, pictures, monkeypatch):
     expected = referee(monkeypatch, random_vgg)(*pictures, normalize=True).flatten()
     network = PerceptualNetwork(random_vgg)
@@ -57,7 +57,7 @@ def test_lpips_is_that_of_torchmetrics(random_vgg, pictures, monkeypatch):
     assert float(against_one[2]) == pytest.approx(float(lpips[2]), rel=1e-3) and against_one[1] > lpips[1]
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def test_cosine_is_the_mean_over_pixels_and_layers(random_vgg, pictures):
     network = PerceptualNetwork(random_vgg)
     x, y = (network.features(picture) for picture in pictures)
@@ -65,13 +65,13 @@ def test_cosine_is_the_mean_over_pixels_and_layers(random_vgg, pictures):
     torch.testing.assert_close(network(*pictures)[1], torch.stack(layers).mean(0), atol=1e-5, rtol=0)
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def test_reduced_precision_ranks_alike(random_vgg, pictures):
     full, reduced = (PerceptualNetwork(random_vgg, precision) for precision in (torch.float32, torch.bfloat16))
     torch.testing.assert_close(full(*pictures)[0], reduced(*pictures)[0], atol=1e-2, rtol=0.05)
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def test_with_the_true_weights(pictures, monkeypatch):
     if not (perceptual_weights.cache_dir() / FILE).exists():
         pytest.skip(f"no {FILE} in the cache folder; evaluate-worldmodel fetches it")
