@@ -87,9 +87,8 @@ class LinearController(PlanningController):
         transposed = np.linalg.solve(moves.T @ moves + self.ridge * np.eye(moves.shape[1]), moves.T @ motions)  # B^T
 
         def cost(sequences: NDArray) -> NDArray:
-            positions = (self._positions[-1] + np.cumsum(sequences @ transposed, axis=1)).astype(
-                np.float64
-            )  # (N, h, 3)
+            ways = np.cumsum(sequences @ transposed, axis=1)
+            positions = np.asarray(self._positions[-1] + ways, np.float64)  # (N, h, 3)
             distances = np.linalg.norm(positions - self.goal.point_world, axis=-1)
             if self.reach:
                 effector = self.effector.path(observation, sequences, self.hold)

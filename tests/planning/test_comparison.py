@@ -8,31 +8,12 @@ import numpy as np
 import pytest
 
 from planning.comparison import comparison_chart, difference_table, differences
-from planning.episode import Record
 from planning.film import film_path
 from planning.filmstrip import filmstrip, telling
 from planning.report import summarise, table
+from tests.planning.servo_records import record
 
 SHARES = (0.1, 0.3, 0.5, 0.8)  # of the way along the optical axis: one setup in each bin
-
-
-def record(model, setup, share, space3d, space2d, final=0.1, pixels=1.0):
-    return Record(
-        model=model,
-        setup=setup,
-        repeat=0,
-        steps=9,
-        initial_distance=0.3,
-        initial_pixel_distance=20.0,
-        axis_share=share,
-        hits_3d=[5 * space3d, 0, 0],
-        hits_2d=[5 * space2d, 0, 0],
-        final_distance=final,
-        final_pixel_distance=pixels,
-        least_distance=final,
-        plan_seconds=0.1,
-        distances=[final],
-    )
 
 
 def records(model, hits_3d, hits_2d):

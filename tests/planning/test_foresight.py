@@ -45,6 +45,7 @@ def test_the_command_compares_and_writes(tmp_path, capsys):
     ("options", "words"),
     [
         ({"plans": 0}, "--plans is 0"),
+        ({"seed": -1}, "--seed is -1"),
         ({"env": "planar-push", "point": "drawer"}, "nothing is known of --env planar-push"),
     ],
 )

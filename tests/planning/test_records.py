@@ -9,32 +9,13 @@ import pytest
 from envs.errors import UsageError
 from planning import servo_eval
 from planning.controllers import CONTROLLERS, Kit
-from planning.episode import Record
 from planning.records import EpisodeLog
 from planning.tasks import TASKS
+from tests.planning.servo_records import record
 
 
 def settings(steps=10, **checkpoints):
     return {"steps": steps, "checkpoints": checkpoints}
-
-
-def record(model, setup=0, repeat=0):
-    return Record(
-        model=model,
-        setup=setup,
-        repeat=repeat,
-        steps=1,
-        initial_distance=0.3,
-        initial_pixel_distance=20.0,
-        axis_share=0.5,
-        hits_3d=[0, 0, 0],
-        hits_2d=[0, 0, 0],
-        final_distance=0.1,
-        final_pixel_distance=5.0,
-        least_distance=0.1,
-        plan_seconds=0.1,
-        distances=[0.1],
-    )
 
 
 def config_of(folder):
@@ -78,7 +59,7 @@ def test_finished_episodes_are_filmed_when_a_film_is_asked_for(tmp_path, monkeyp
 
     def run_episode(env, setup, drawn, steps, repeat, watch):
         ran.append(drawn)
-        return record("random", setup.index, repeat)
+        return record("random", setup.index, repeat=repeat)
 
     monkeypatch.setattr(servo_eval, "run_episode", run_episode)
     monkeypatch.setattr(servo_eval, "Film", Reel)
