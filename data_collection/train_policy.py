@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,7 +94,7 @@ def main(config: Config) -> None:
         if missing > 0:
             model.learn(missing, callback=_callback(config, bar.update), reset_num_timesteps=False)
     save(model, config.out)
-    print(f"{config.out}: {model.num_timesteps} steps; use it with: collect-rollouts --policy {config.out}")
+    print(f"{config.out}: {model.num_timesteps} steps; use it with: {collecting(config)}")
     if config.trials:
         print(_trial(config, env, model))
 
@@ -119,6 +120,14 @@ def check_continues(config: Config) -> None:
                 f"{config.out} was trained with {name} = {before.get(name)!r}, not {asked!r}; "
                 "run with the same options to go on with it, or choose another --out"
             )
+
+
+def collecting(config: Config) -> str:
+    """The command that collects episodes with the policy, of goals like those that it was trained with."""
+    words = ["collect-rollouts", "--env", config.env, "--policy", str(config.out), "--out", "DIR"]
+    if config.goal_angle < Config.goal_angle:
+        words += ["--env-kwargs", json.dumps({"goal_angle": config.goal_angle})]
+    return shlex.join(words)
 
 
 def save(model: Any, path: Path) -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import shlex
 
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+import tyro
 from commands import call
 
 from data_collection import hand_pictures, train_policy
@@ -219,6 +222,14 @@ def test_training_goes_on_where_it_stopped(trained, tmp_path):
     assert load_model(path).num_timesteps == 112
     with pytest.raises(UsageError, match="is not the policy it was"):
         make_policy(policy_name(trained).replace(str(trained), str(path)))
+
+
+def test_a_trained_policy_says_how_to_collect_with_it(tmp_path):
+    config = train_policy.Config(tmp_path / "my hand.zip", goal_angle=45)
+    words = shlex.split(train_policy.collecting(config))
+    asked = tyro.cli(Config, args=words[1:])
+    assert (asked.env, asked.policy) == ("dexhand", str(config.out))
+    assert json.loads(asked.env_kwargs) == {"goal_angle": 45}
 
 
 def test_a_part_of_a_run_has_its_own_episodes_and_any_device(trained, tmp_path, monkeypatch):
