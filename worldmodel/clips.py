@@ -20,8 +20,9 @@ from data_collection.dataset import RGBDDataset
 from envs import ground_truth
 from envs.errors import UsageError
 
-ACTION_COLUMNS = ("action", "joint_delta")
-"""What a model may be conditioned on: what was commanded, or how far each joint went, which tells of the outcome."""
+ACTION_COLUMNS = ("action", "action_change", "joint_delta")
+"""What a model may be conditioned on: what was commanded; by how much absolute commands differ from those before them;
+or how far each joint went, which tells of the outcome."""
 HELD = ("rgb", "depth")
 """What is held in memory where it fits."""
 PICTURES = (*HELD, "segmentation")
@@ -69,12 +70,33 @@ def action_units(dataset: RGBDDataset, action_column: str) -> tuple[tuple[str, .
     """How each number of an action adds up over a frame gap, and how many metres or radians 1 stands for in it.
 
     Raises:
-        UsageError: no such column.
+        UsageError: no such column, or changes are asked for of actions that are changes themselves.
     """
+    if action_column == "joint_delta":
+        joints = dataset.width(action_column)
+        return ("sum",) * joints, (1.0,) * joints
+    aggregation = tuple(dataset.attrs["action_aggregation"])
+    scale = tuple(float(unit) for unit in dataset.attrs["action_scale"])
     if action_column == "action":
-        return tuple(dataset.attrs["action_aggregation"]), tuple(float(unit) for unit in dataset.attrs["action_scale"])
-    joints = dataset.width(action_column)
-    return ("sum",) * joints, (1.0,) * joints
+        return aggregation, scale
+    if set(aggregation) != {"last"}:
+        raise UsageError(
+            f"action-column is '{action_column}', but the actions of {dataset.attrs['env_id']} are not all absolute "
+            f"({', '.join(aggregation)}); give --action-column action"
+        )
+    return ("sum",) * len(scale), scale
+
+
+def action_changes(actions: NDArray[Any], slices: NDArray[np.int64]) -> NDArray[Any]:
+    """(N, A) what each action of some episodes changes in the one before; 0 in an episode's first.
+
+    Args:
+        actions: (N, A), absolute.
+        slices: (E, 2) first row of each episode, and the one after its last.
+    """
+    changes = np.diff(actions, axis=0, prepend=actions[:1])
+    changes[slices[:, 0]] = 0
+    return changes
 
 
 class ClipSource:
@@ -109,9 +131,9 @@ class ClipSource:
         """Whether pictures are held; what `share` decided holds here too."""
         if share is not None:
             self.in_memory = share.in_memory
+        self.action_aggregation, self.action_scale = action_units(dataset, action_column)
         self._hold((action_column, *HELD) if self.in_memory else (action_column,))
         self.action_dim = int(self._columns[action_column].shape[1])
-        self.action_aggregation, self.action_scale = action_units(dataset, action_column)
 
     def starts(self, frames: int) -> NDArray[np.int64]:
         """First rows of all clips of `frames` frames."""
@@ -199,7 +221,12 @@ class ClipSource:
 
     def _hold(self, names: Sequence[str]) -> None:
         for name in names:
-            if name not in self._columns:
+            if name in self._columns:
+                continue
+            if name == "action_change":
+                self._hold(("action",))
+                self._columns[name] = action_changes(self._columns["action"], self.dataset.episode_slices)
+            else:
                 self._columns[name] = self.dataset.load(name)
 
     def _read(self, names: Sequence[str], rows: NDArray[np.int64]) -> dict[str, NDArray[Any]]:

@@ -154,6 +154,20 @@ def test_joint_deltas_in_place_of_commands(tmp_path, write_dataset):
     assert moved.with_actions("joint_delta") is moved
 
 
+def test_changes_of_absolute_commands(tmp_path, write_dataset):
+    relative = RGBDDataset(write_dataset(tmp_path / "relative", [12, 12]))
+    with pytest.raises(UsageError, match="not all absolute"):
+        ClipSource(relative, GAP, action_column="action_change")
+    dataset = RGBDDataset(write_dataset(tmp_path / "absolute", [12, 12], action_aggregation=["last"] * 7))
+    commands = dataset.load("action")
+    changed = ClipSource(dataset, GAP, action_column="action_change")
+    told = changed.at(np.array([12, 13]), 3).actions.numpy()
+    assert changed.action_dim == 7 and changed.action_scale == ClipSource(dataset, GAP).action_scale
+    np.testing.assert_allclose(told[0, 0], commands[14] - commands[12], atol=1e-6)  # an episode begins: from its first
+    np.testing.assert_allclose(told[0, 1], commands[17] - commands[14], atol=1e-6)
+    np.testing.assert_allclose(told[1, 0], commands[15] - commands[12], atol=1e-6)
+
+
 def test_colour_jitter_changes_colours_only_and_whole_clips_alike(source, starts):
     clips = source.at(starts[:4], 2)
     still = torch.stack((clips.rgb[:, 0],) * 2, dim=1)
