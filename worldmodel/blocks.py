@@ -71,6 +71,7 @@ class Upsample(nn.ConvTranspose2d):
         """`(B, inputs, H, W)` to `(B, outputs, 2H, 2W)`."""
         device = x.device.type
         weight, bias = self.weight, self.bias
+        assert bias is not None
         if torch.is_autocast_enabled(device):  # which does not look into a function of one's own
             precision = torch.get_autocast_dtype(device)
             x, weight, bias = x.to(precision), weight.to(precision), bias.to(precision)
