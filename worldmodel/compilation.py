@@ -18,6 +18,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 logger = logging.getLogger(__name__)
 OLDEST_GPU = (7, 0)
 """Compute capability from which on Triton makes kernels."""
+ONE_LOOP = {"realize_reads_threshold": 1000, "realize_opcount_threshold": 10_000, "realize_acc_reads_threshold": 10_000}
+"""Settings under which TorchInductor keeps what a long chain of pointwise operators computes in registers. By default
+most of it goes to memory, lest the C++ compiler be given too much; nearest neighbours take twice as long then."""
 
 
 @functools.cache
@@ -54,10 +57,11 @@ def compiled(function: Function) -> Function:
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         nonlocal fast, failed
-        if failed or torch.compiler.is_compiling() or not can_compile(_device_of(args)):
+        device = _device_of(args)
+        if failed or torch.compiler.is_compiling() or not can_compile(device):
             return function(*args, **kwargs)
         if fast is None:
-            fast = torch.compile(function, dynamic=False)
+            fast = torch.compile(function, dynamic=False, options=_one_loop() if device == "cpu" else None)
         try:
             return fast(*args, **kwargs)
         except RuntimeError as error:
@@ -71,6 +75,12 @@ def compiled(function: Function) -> Function:
             return function(*args, **kwargs)
 
     return call  # type: ignore[return-value]
+
+
+def _one_loop() -> dict[str, Any]:
+    """What this version of PyTorch has of these settings."""
+    known = torch._inductor.list_options()
+    return {name: value for name, value in ONE_LOOP.items() if name in known}
 
 
 def _device_of(args: tuple[Any, ...]) -> str:

@@ -14,6 +14,7 @@ from worldmodel.compilation import compiled
 EDGE_SHARPNESS = 10.0
 """How fast smoothness lets go at an edge of a picture in [0, 1]; with the paper's 1 an edge hardly counts."""
 _BEYOND_M = 1e4  # where the cloud ends: farther away than any true neighbour
+_CLOUDS_AT_ONCE = 16  # that are searched together for neighbours in windows
 _AT_ONCE = 256  # points whose distances to a whole cloud are taken together
 
 
@@ -61,13 +62,17 @@ def reconstruction(predicted: Tensor, target: Tensor, power: int) -> Tensor:
 def _scan_row(
     query: Tensor, rows: Tensor, best: Tensor, where: Tensor, first: Tensor, window: int
 ) -> tuple[Tensor, Tensor]:
-    """One row of the window: the running minimum over its `window` shifts."""
+    """One row of the window: the running minimum over its `window` shifts.
+
+    Written out by coordinates, and with a minimum in place of a second choice, it compiles to one loop.
+    """
     width = query.shape[-1]
+    x, y, z = query.unbind(1)
     for shift in range(window):
-        distance = (query - rows[..., shift : shift + width]).square().sum(1)
-        nearer = distance < best
-        best = torch.where(nearer, distance, best)
-        where = torch.where(nearer, first + shift, where)
+        u, v, w = rows[..., shift : shift + width].unbind(1)
+        distance = (x - u).square() + (y - v).square() + (z - w).square()
+        where = torch.where(distance < best, first + shift, where)
+        best = torch.minimum(distance, best)
     return best, where
 
 
@@ -75,7 +80,7 @@ def nearest_in_window(query: Tensor, reference: Tensor, radius: int) -> Tensor:
     """The nearest reference point of each query point among the (2 radius + 1)^2 pixels around its own.
 
     A running minimum over shifted views: it needs the memory of one distance a pixel, where `unfold` needs one a pixel
-    and shift.
+    and shift. A few clouds at a time, which stay in a core's cache.
 
     Args:
         query: (B, 3, H, W) metres.
@@ -85,24 +90,36 @@ def nearest_in_window(query: Tensor, reference: Tensor, radius: int) -> Tensor:
     Returns:
         (B, H, W) int64, the flat index y * W + x of the nearest reference point.
     """
+    with torch.no_grad():
+        parts = zip(query.detach().split(_CLOUDS_AT_ONCE), reference.detach().split(_CLOUDS_AT_ONCE), strict=True)
+        return torch.cat([_pixel_at(_nearest_shift(*part, radius), radius) for part in parts])
+
+
+def _nearest_shift(query: Tensor, reference: Tensor, radius: int) -> Tensor:
+    """(B, H, W) int32, which of the window's shifts leads to the nearest point."""
     window = 2 * radius + 1
     batch, _, height, width = query.shape
-    with torch.no_grad():
-        query = query.detach().contiguous()
-        padded = torch.nn.functional.pad(reference.detach(), (radius,) * 4, value=_BEYOND_M)
-        best = query.new_full((batch, height, width), float("inf"))
-        # A point that is not finite has no nearest neighbour: it keeps its own pixel, and the loss is not finite.
-        own = radius * window + radius
-        where = torch.full((batch, height, width), own, dtype=torch.int32, device=query.device)
-        for row in range(window):
-            first = torch.full((), row * window, dtype=torch.int32, device=query.device)
-            rows = padded[:, :, row : row + height].contiguous()
-            best, where = _scan_row(query, rows, best, where, first, window)
-        where = where.long()
-        y = torch.arange(height, device=query.device).view(-1, 1) + where // window - radius
-        x = torch.arange(width, device=query.device) + where % window - radius
-        # Beside points that are not finite even the edge beyond the picture is near.
-        return y.clamp(0, height - 1) * width + x.clamp(0, width - 1)
+    query = query.contiguous()
+    padded = torch.nn.functional.pad(reference, (radius,) * 4, value=_BEYOND_M)
+    best = query.new_full((batch, height, width), float("inf"))
+    # A point that is not finite has no nearest neighbour: it keeps its own pixel, and the loss is not finite.
+    own = radius * window + radius
+    where = torch.full((batch, height, width), own, dtype=torch.int32, device=query.device)
+    for row in range(window):
+        first = torch.full((), row * window, dtype=torch.int32, device=query.device)
+        best, where = _scan_row(query, padded[:, :, row : row + height], best, where, first, window)
+    return where
+
+
+@compiled
+def _pixel_at(shift: Tensor, radius: int) -> Tensor:
+    """(B, H, W) int64, the flat index of the pixel to which a shift leads from each one's own."""
+    window = 2 * radius + 1
+    height, width = shift.shape[-2:]
+    y = torch.arange(height, dtype=torch.int32, device=shift.device).view(-1, 1) + shift // window - radius
+    x = torch.arange(width, dtype=torch.int32, device=shift.device) + shift % window - radius
+    # Beside points that are not finite even the edge beyond the picture is near.
+    return (y.clamp(0, height - 1) * width + x.clamp(0, width - 1)).long()
 
 
 @compiled
@@ -166,6 +183,7 @@ def alignment(moved: Tensor, target: Tensor, weights: LossWeights) -> Tensor:
     return knn_alignment(moved, target, weights.knn_radius)
 
 
+@compiled
 def edge_aware_smoothness(flow: Tensor, rgb: Tensor) -> Tensor:
     """Mean second difference of a flow, let go at edges of the picture it starts from (section III-E).
 

@@ -27,8 +27,9 @@ _BILINEAR, _ZEROS, _ALIGN_CORNERS = 0, 0, True
 def _scatter(values: Tensor, grid: Tensor) -> Tensor:
     if _order_matters(values):
         return _scatter_in_order(values, grid)
+    # The second argument, the picture that was sampled, is not looked at for this gradient.
     out, _ = torch.ops.aten.grid_sampler_2d_backward(
-        values, torch.zeros_like(values), grid, _BILINEAR, _ZEROS, _ALIGN_CORNERS, (True, False)
+        values, values, grid, _BILINEAR, _ZEROS, _ALIGN_CORNERS, (True, False)
     )
     return out
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from worldmodel.blocks import ConvLSTM, LSTMState, join, layer_norm
+from worldmodel.blocks import ConvLSTM, LSTMState, Upsample, join, layer_norm
 from worldmodel.config import ModelConfig
 
 STRIDE = 8
@@ -108,13 +108,13 @@ class Decoder(nn.Module):
         super().__init__()
         lstm_kernel = config.lstm_kernel
         small, middle, large = (scaled(c, config.width) for c in (32, 64, 128))
-        self.up1 = nn.ConvTranspose2d(large, middle, 4, stride=2, padding=1)
+        self.up1 = Upsample(large, middle)
         self.lstm6 = ConvLSTM(middle, middle, lstm_kernel)
         self.norm6 = layer_norm(middle)
-        self.up2 = nn.ConvTranspose2d(2 * middle, small, 4, stride=2, padding=1)
+        self.up2 = Upsample(2 * middle, small)
         self.lstm7 = ConvLSTM(small, small, lstm_kernel)
         self.norm7 = layer_norm(small)
-        self.up3 = nn.ConvTranspose2d(2 * small, small, 4, stride=2, padding=1)
+        self.up3 = Upsample(2 * small, small)
         self.refine = nn.Conv2d(small + fine_channels(config), small, 3, padding=1) if config.fine_skip else None
         self.norm8 = layer_norm(small)
         self.head = nn.Conv2d(small, outputs, 1)

@@ -43,7 +43,7 @@ def test_without_a_compiler_it_is_the_plain_function(monkeypatch):
 def test_a_compiler_that_fails_is_named_once_and_not_asked_again(monkeypatch, caplog):
     asked = []
 
-    def broken(function, dynamic):
+    def broken(function, dynamic, options):
         def call(x):
             asked.append(x)
             raise Failed("no space left on device")
@@ -60,7 +60,7 @@ def test_a_compiler_that_fails_is_named_once_and_not_asked_again(monkeypatch, ca
 
 
 def test_errors_of_the_function_itself_are_its_own(monkeypatch):
-    monkeypatch.setattr(torch, "compile", lambda function, dynamic: function)
+    monkeypatch.setattr(torch, "compile", lambda function, dynamic, options: function)
     monkeypatch.setattr(compilation, "can_compile", lambda device: True)
     with pytest.raises(RuntimeError, match="not a number"):
         compiled(double)(torch.tensor([torch.nan]))

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from worldmodel.blocks import ConvLSTM, layer_norm, lstm_gates
+from worldmodel.blocks import ConvLSTM, Upsample, layer_norm, lstm_gates
 from worldmodel.config import ModelConfig
 from worldmodel.trunk import Decoder, Encoder, scaled
 
@@ -41,6 +41,18 @@ def test_convlstm_forgets_little_at_first():
     torch.manual_seed(0)
     enter, candidate, forget, leave = ConvLSTM(8, 8, kernel=3).gates.bias.chunk(4)
     assert forget.min() > 0.8 and max(part.abs().max() for part in (enter, candidate, leave)) < 0.2
+
+
+def test_upsampling_is_a_transposed_convolution_there_and_back():
+    layer = Upsample(8, 16)
+    x = torch.randn(2, 8, 4, 6, requires_grad=True)
+    inputs = (x, layer.weight, layer.bias)
+    got, want = layer(x), F.conv_transpose2d(*inputs, stride=2, padding=1)
+    torch.testing.assert_close(got, want)
+    upstream = torch.randn_like(got)
+    gradients = (torch.autograd.grad(out, inputs, upstream) for out in (got, want))
+    for ours, theirs in zip(*gradients, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
 
 
 def test_layer_norm_is_over_the_whole_picture():
