@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -20,7 +21,7 @@ RENDER_MODES = ("rgb_array", "depth_array", "rgbd_tuple")
 Picture = tuple[NDArray[np.uint8], NDArray[np.float32]]
 
 
-class RGBDEnv(gymnasium.Env):
+class RGBDEnv(gymnasium.Env, ABC):
     """A MuJoCo model seen by an RGB-D camera that stands still; the base of the environments here.
 
     A subclass states what is below, implements `reset`, `step`, `_measurements`, `_own_state` and `_set_own_state`, and
@@ -160,21 +161,21 @@ class RGBDEnv(gymnasium.Env):
 
     # --- What environments add, or do in their own way -------------------------------------------------------------
 
+    @abstractmethod
     def _measurements(self) -> dict[str, NDArray]:
         """What is observed beside the pictures."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _own_state(self) -> ArrayLike:
         """What the environment itself remembers: (OWN_STATE,) numbers."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _set_own_state(self, own: NDArray[np.float64]) -> None:
         """Remember what `_own_state` gave.
 
         Raises:
             UsageError: it cannot have come from there.
         """
-        raise NotImplementedError
 
     def _after_physics(self) -> None:
         """Bring what is seen up to date with the state; leaves the state itself alone."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ TCP = slice(0, 3)  # position of the end-effector in `proprio` of the tabletop, 
 GRIPPER = 14  # last gripper command in it
 
 
-class Effector:
+class Effector(ABC):
     """An end-effector that goes where it is told, along the world's x and y, or x, y and z.
 
     Attributes:
@@ -35,19 +36,19 @@ class Effector:
     low: Array
     high: Array
 
-    def reset(self, observation: Observation) -> None:
+    def reset(self, observation: Observation) -> None:  # noqa: B027  # most bodies remember nothing
         """Start an episode with its first observation."""
 
-    def aim(self, way: Array) -> None:
+    def aim(self, way: Array) -> None:  # noqa: B027  # ... and need no heading
         """Be told, before every decision, which way (3,) the designated point has to go, metres, world frame."""
 
+    @abstractmethod
     def position(self, observation: Observation) -> Array:
         """Measured position (3,) in the world, metres."""
-        raise NotImplementedError
 
+    @abstractmethod
     def action(self, move: NDArray) -> NDArray[np.float32]:
         """Moves (..., axes) as actions (..., action_dim) of the environment."""
-        raise NotImplementedError
 
     def path(self, observation: Observation, moves: NDArray, hold: int) -> Array:
         """Where moves (N, h, axes), each held for `hold` control steps, take it if nothing is in the way: (N, h, 3)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,7 +33,7 @@ class Surface:
     """metres around the point within which pixels say how the body moves"""
 
 
-class Follower:
+class Follower(ABC):
     """Follows the designated point by observations.
 
     Attributes:
@@ -43,17 +44,17 @@ class Follower:
     point: Array
     least_foreground: float
 
+    @abstractmethod
     def reset(self, observation: Observation, goal: Goal) -> None:
         """Start an episode with its first observation."""
-        raise NotImplementedError
 
+    @abstractmethod
     def observe(self, observation: Observation) -> None:
         """Take in the observation of every control step, the first one again included."""
-        raise NotImplementedError
 
+    @abstractmethod
     def pixels(self, observation: Observation, camera: CameraModel) -> torch.Tensor:
         """The pixels (M,) int64, counted row by row, that show the body of the point in the last observation."""
-        raise NotImplementedError
 
 
 class EffectorFollower(Follower):

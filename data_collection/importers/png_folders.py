@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -37,7 +38,7 @@ NUMBERED = re.compile(r"([a-z]+)0*(\d+)\.(png|txt)")
 
 
 @dataclass(frozen=True, eq=False)
-class PngFolders:
+class PngFolders(ABC):
     """A split of such a dataset. The layout tells no camera pose: the world is the camera frame."""
 
     format: ClassVar[str]
@@ -101,6 +102,7 @@ class PngFolders:
         }
         return Episode(columns, (*depth_check.notes(), *notes))
 
+    @abstractmethod
     def robot(
         self, folder: Path, files: dict[str, list[Path]], count: int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], list[str]]:
@@ -109,7 +111,6 @@ class PngFolders:
         Raises:
             Damaged: it is not what the layout says.
         """
-        raise NotImplementedError
 
     def _numbered_files(self, folder: Path) -> dict[str, list[Path]]:
         """The files of each series in the order of their numbers, one of each for every frame."""
