@@ -13,7 +13,10 @@ LatentKind = Literal["none", "step", "clip"]
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Architecture of a model; the defaults are the paper's."""
+    """Architecture of a model.
+
+    Widths, ConvLSTM kernels and the number of masks are the paper's by default; docs/model.md lists what departs from it.
+    """
 
     width: float = 1.0
     """Multiplier on every channel count: 1.0 is the paper's network, 0.5 the CPU preset's."""
