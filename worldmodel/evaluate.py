@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import tyro
 from tqdm import tqdm
 
 from data_collection.dataset import RGBDDataset
@@ -42,7 +43,7 @@ class EvaluationOptions:
     """Dataset that no model was trained on."""
     out: Path = Path("runs/evaluation")
     """Folder for evaluation.json, evaluation.md and curves.png."""
-    models: tuple[str, ...] = ("t3vip",)
+    models: Annotated[tuple[str, ...], tyro.conf.arg(aliases=("--model",))] = ("t3vip",)
     """Shipped names, training runs, or folders with config.json and model.safetensors."""
     clips: int = 256
     """Clips, spread evenly over the dataset."""

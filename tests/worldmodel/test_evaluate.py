@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from data_collection.dataset import RGBDDataset
-from envs.command import run
+from envs.command import parse, run
 from worldmodel import evaluate as command
 from worldmodel.checkpoint import save_model
 from worldmodel.evaluate import EvaluationOptions, main
@@ -123,6 +123,11 @@ def test_the_report_says_that_a_model_was_trained_on_the_data(evaluate, make_mod
     assert rate.endswith("was trained on 10") and seen.startswith(f"{name} was trained on this data")
     report = (tmp_path / "out" / "evaluation.md").read_text()
     assert rate in report and seen in report
+
+
+def test_one_model_may_be_called_by_either_name():
+    options = [parse(EvaluationOptions, ["--data", "d", name, "sv2p"]) for name in ("--model", "--models")]
+    assert options[0] == options[1] and options[0].models == ("sv2p",)
 
 
 def test_mistakes_are_one_line(evaluate, model_folder, make_model, write_dataset, camera_of, tmp_path, capsys):
