@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,9 +11,10 @@ import torch
 
 from planning.controllers.base import Goal
 from planning.controllers.t3vip import T3VIPController
+from planning.costs import env_action
 from planning.episode import run_episode
 from planning.icem import ICEM, ICEMConfig
-from planning.setups import make_setup
+from planning.setups import CLEARANCE, make_setup
 from worldmodel import load_model
 
 SETUPS = (0, 1, 2)
@@ -89,11 +92,33 @@ def test_fails_when_action_channels_are_shuffled_before_the_model(env, model):
     assert sum(share < NEAR for share in shares) <= 1, shares
 
 
-def test_pictures_do_not_show_the_goal(env):
-    setup = make_setup(env, 0, seed=99)
-    first = setup.start(env)
-    other = Goal(setup.goal.point_world + 0.1, setup.goal.pixel + 5)
-    controller = T3VIPController(load_model("t3vip"), env.unwrapped.camera, planner())
-    controller.reset(first, other)
-    again = setup.start(env)
-    assert np.array_equal(first["rgb"], again["rgb"]) and np.array_equal(first["depth"], again["depth"])
+class Witness:
+    """Keeps what it is shown, and stands still."""
+
+    name = "witness"
+
+    def __init__(self) -> None:
+        self.plan_seconds = [0.0]
+        self.shown: list[dict] = []
+
+    def reset(self, observation, goal) -> None:
+        pass
+
+    def act(self, observation):
+        self.shown.append(observation)
+        return env_action(np.zeros(3), observation["proprio"][-1])
+
+
+def test_neither_pictures_nor_scene_show_the_goal(env):
+    camera, data = env.unwrapped.camera, env.unwrapped.mj_data
+    setup, witnesses = make_setup(env, 0, seed=99), []
+    for shift in (0.0, -0.05):
+        point = setup.goal.point_world + shift
+        goal = Goal(point, camera.project(camera.to_camera(point)))
+        witnesses.append(Witness())
+        run_episode(env, replace(setup, goal=goal), witnesses[-1], steps=3)
+        things = np.concatenate([data.xpos, data.geom_xpos, data.site_xpos, data.light_xpos])
+        assert np.linalg.norm(things - point, axis=1).min() > CLEARANCE
+    for one, other in zip(*(witness.shown for witness in witnesses), strict=True):
+        assert one.keys() == other.keys() == env.observation_space.spaces.keys()
+        assert all(np.array_equal(one[key], other[key]) for key in one)
