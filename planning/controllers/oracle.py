@@ -1,4 +1,4 @@
-"""The same planner with the simulator as its model: the upper bound."""
+"""The same planner with the true dynamics: the simulator is its model."""
 
 from __future__ import annotations
 
