@@ -15,7 +15,7 @@ LatentKind = Literal["none", "step", "clip"]
 class ModelConfig:
     """Architecture of a model.
 
-    Widths, ConvLSTM kernels and the number of masks are the paper's by default; docs/model.md lists what departs from it.
+    By default widths, ConvLSTM kernels and the number of masks are the paper's; docs/model.md lists what departs.
     """
 
     width: float = 1.0
