@@ -155,8 +155,9 @@ class RGBDEnv(gymnasium.Env, ABC):
         state, size = np.array(state, np.float64), self.state_size
         if state.shape != (size,) or not np.isfinite(state).all():
             raise UsageError(f"the state has shape {state.shape}; give {size} finite numbers from get_state()")
-        self._set_own_state(state[-self.OWN_STATE :])
-        mujoco.mj_setState(self.mj_model, self.mj_data, state[: -self.OWN_STATE], INTEGRATION_STATE)
+        physics, own = np.split(state, [size - self.OWN_STATE])
+        self._set_own_state(own)
+        mujoco.mj_setState(self.mj_model, self.mj_data, physics, INTEGRATION_STATE)
         self._after_physics()
 
     # --- What environments add, or do in their own way -------------------------------------------------------------

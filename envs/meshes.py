@@ -11,6 +11,7 @@ import hashlib
 import itertools
 import os
 import tempfile
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,7 +52,7 @@ def light_mesh(paths: Sequence[Path], max_faces: int = 500) -> Mesh:
     for path in paths:
         key.update(hashlib.sha256(path.read_bytes()).digest())
     cached = cache_dir() / "meshes" / f"{key.hexdigest()[:32]}.npz"
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile):  # not there, or damaged
         if cached.exists():
             with np.load(cached, allow_pickle=False) as arrays:
                 return Mesh(arrays["vertices"], arrays["faces"])

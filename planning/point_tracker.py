@@ -12,6 +12,7 @@ their point with it.
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,13 +32,28 @@ AGREES = 0.012  # m; a point of the piece is in sight where the depth seen is no
 MIN_POINTS = 4  # of the piece that must be in sight to say where it is seen
 
 
-def grid(shift: float, turn: float, shifts: int, turns: int) -> Array:
-    """Motions (shifts * shifts * turns, 3) up to `shift` metres along x and y and `turn` radians, evenly spaced."""
-    along, around = np.linspace(-shift, shift, shifts), np.linspace(-turn, turn, turns)
-    return np.array(list(itertools.product(along, along, around)))
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Motions (dx, dy, turn), evenly spaced; metres and radians.
+
+    Attributes:
+        motions: (N, 3).
+        spacing: (3,) from one to the next.
+    """
+
+    motions: Array
+    spacing: Array
+
+    @classmethod
+    def upto(cls, shift: float, turn: float, shifts: int, turns: int) -> Grid:
+        """Up to `shift` metres along x and y, in so many steps each, and up to `turn` radians."""
+        (along, pace), (around, angle) = (
+            np.linspace(-end, end, count, retstep=True) for end, count in ((shift, shifts), (turn, turns))
+        )
+        return cls(np.array(list(itertools.product(along, along, around))), np.array([pace, pace, angle]))
 
 
-NEARBY, WIDE = grid(0.018, 0.08, 5, 3), grid(0.045, 0.9, 9, 13)
+NEARBY, WIDE = Grid.upto(0.018, 0.08, 5, 3), Grid.upto(0.045, 0.9, 9, 13)
 """Motions of one step that are tried: what a push does, and what happens where the tip catches in a corner."""
 
 
@@ -82,21 +98,21 @@ class PointTracker:
             motion = min((motion, poorness), self._fit(seen, WIDE), key=lambda fit: fit[1])[0]
         self._last, self._motion, self._depth = motion - self._motion, motion, depth
 
-    def _fit(self, seen: Array, tries: Array) -> tuple[Array, float]:
+    def _fit(self, seen: Array, tries: Grid) -> tuple[Array, float]:
         """The motion (3,) since the first frame that agrees best, and how badly it still does.
 
         Args:
             seen: (H, W, 4) colours in [0, 1] and depth of the new frame.
-            tries: (N, 3) motions since the last frame to start from.
+            tries: motions since the last frame to start from.
         """
         expected = self._motion + SLOWING * self._last
 
         def disagreement(motion: Array) -> Array:
             return self._disagreement(motion[None], seen, expected)[0]
 
-        starts = np.concatenate([expected[None], self._motion + tries])
+        starts = np.concatenate([expected[None], self._motion + tries.motions])
         start = starts[np.argmin(soft(self._disagreement(starts, seen, expected)).sum(axis=1))]
-        room = 2 * tries[-1] / (round(len(tries) ** (1 / 3)) - 1)  # to the neighbours of a start, or a bit more
+        room = tries.spacing  # to the neighbours of a start
         found = least_squares(
             disagreement, start, bounds=(start - room, start + room), loss="soft_l1", x_scale=SURPRISE, max_nfev=20,
             xtol=1e-4, ftol=1e-4,

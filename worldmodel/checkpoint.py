@@ -25,7 +25,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -34,12 +34,11 @@ from torch import Tensor, nn
 
 from envs.errors import UsageError
 from worldmodel.config import ModelConfig, ModelContext
-from worldmodel.devices import best_precision, find_device
+from worldmodel.devices import Precision, find_device, find_precision
 from worldmodel.inference import InferenceNetwork, inference_network
 from worldmodel.models import make_model
 from worldmodel.world_model import WorldModel
 
-Precision = Literal["auto", "float32", "bfloat16"]
 PRETRAINED = Path(__file__).parent / "pretrained"
 WEIGHTS, CONFIG, TRAINING, STATE = "model.safetensors", "config.json", "training.safetensors", "state.json"
 INFERENCE = "inference.safetensors"
@@ -139,7 +138,7 @@ def load_model(name: str | Path, device: str | torch.device = "cpu", precision: 
         raise UsageError(
             f"the model in {folder} cannot be read ({reason}); train it again or restore the folder"
         ) from error
-    model.precision = best_precision(device) if precision == "auto" else getattr(torch, precision)
+    model.precision = getattr(torch, find_precision(precision, device))
     return model.to(device).to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
 

@@ -1,12 +1,15 @@
-"""Which device a model runs on."""
+"""Which device a model runs on, and in what precision."""
 
 from __future__ import annotations
 
 import os
+from typing import Literal
 
 import torch
 
 from envs.errors import UsageError
+
+Precision = Literal["auto", "float32", "bfloat16"]
 
 
 def find_device(name: str | torch.device) -> torch.device:
@@ -40,6 +43,13 @@ def prepare_devices(deterministic: bool) -> None:
         torch.backends.cudnn.deterministic = True
         torch.use_deterministic_algorithms(True)
         torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]  # nothing reads it
+
+
+def find_precision(name: Precision, device: torch.device) -> Literal["float32", "bfloat16"]:
+    """The name of a precision; of `auto`, that of the best there is."""
+    if name != "auto":
+        return name
+    return "bfloat16" if best_precision(device) == torch.bfloat16 else "float32"
 
 
 def best_precision(device: torch.device) -> torch.dtype:

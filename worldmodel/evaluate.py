@@ -118,8 +118,11 @@ def main(options: EvaluationOptions) -> None:
 def _remarks(name: str, model: WorldModel, dataset: RGBDDataset) -> list[str]:
     """What the reader of the report must know about this model on this data."""
     notes = check_fits(name, model, dataset)
-    if load_origin(name).get("data", {}).get("train") == dataset.content_hash:
+    seen = load_origin(name).get("data", {})
+    if seen.get("train") == dataset.content_hash:
         notes.append(f"{name} was trained on this data: its scores say nothing about data that it has not seen")
+    elif seen.get("validation") == dataset.content_hash:
+        notes.append(f"{name} was chosen by its scores on this data, which are therefore a little too good")
     return notes
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -44,7 +45,7 @@ class LossWeights:
 
     def __post_init__(self) -> None:
         for name in ("rgb", "depth", "knn", "scene_smoothness", "optical_smoothness", "kl"):
-            if getattr(self, name) < 0:
+            if not 0 <= getattr(self, name) < math.inf:
                 raise UsageError(
                     f"the loss weight {name} is {getattr(self, name)}; give 0 to leave the term out, or more"
                 )

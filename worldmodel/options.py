@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -10,6 +11,7 @@ import tyro
 
 from envs.errors import UsageError
 from worldmodel.config import ModelConfig
+from worldmodel.devices import Precision
 from worldmodel.losses import LossWeights
 from worldmodel.models import ModelName
 
@@ -32,6 +34,16 @@ class Schedule:
     """Until which fraction of the run clips have how many frames: short clips first, where a step is cheap."""
 
     def __post_init__(self) -> None:
+        for name in ("warmup", "final_rate"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UsageError(f"{name.replace('_', '-')} is {getattr(self, name)}; give a share from 0 to 1")
+        for name in ("truth_until", "posterior_from"):  # beyond 1 is after the end
+            if not getattr(self, name) >= 0:
+                raise UsageError(
+                    f"{name.replace('_', '-')} is {getattr(self, name)}; give a share of the run, 0 or more"
+                )
+        if not 0 <= self.kl_ramp[0] <= self.kl_ramp[1] <= 1:
+            raise UsageError(f"kl-ramp is {self.kl_ramp}; give two fractions of the run, 0 to 1, the earlier one first")
         ends = [end for end, _ in self.clip_lengths]
         if not ends or ends != sorted(ends) or ends[-1] != 1.0 or min(frames for _, frames in self.clip_lengths) < 3:
             raise UsageError(
@@ -94,8 +106,9 @@ class TrainOptions:
     """How far each clip's colours are changed, lest the model cling to those of its scene; 0 for never."""
     seed: int = 0
     """Decides weights, clips and noise."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """What the network runs in; geometry, splatting and losses always run in float32."""
+    precision: Precision = "float32"
+    """What the network runs in; geometry, splatting and losses always run in float32. `auto` is bfloat16 where the
+    device has instructions for it, else float32; what it came to is written down, and a run that goes on keeps it."""
     device: str = "auto"
     """`cpu`, `cuda`, or `auto` for a GPU where there is one."""
     deterministic: bool = False
@@ -120,7 +133,7 @@ class TrainOptions:
             raise UsageError(f"minutes is {self.minutes}; give a positive number such as 20, or --steps instead")
         if self.memory_limit is not None and not self.memory_limit >= 0:
             raise UsageError(f"memory-limit is {self.memory_limit}; give GB, or 0 to read everything from the disk")
-        if self.learning_rate <= 0:
+        if not 0 < self.learning_rate < math.inf:
             raise UsageError(f"learning-rate is {self.learning_rate}; give a positive number such as 1e-3")
         if not self.clip_gradient > 0:
             raise UsageError(f"clip-gradient is {self.clip_gradient}; give a positive number, inf for no limit")
@@ -137,7 +150,7 @@ class TrainOptions:
 _ANYWHERE = tyro.MISSING  # the command line must say
 
 PRESETS: dict[str, TrainOptions] = {
-    "paper": TrainOptions(_ANYWHERE, _ANYWHERE, "paper", precision="bfloat16"),
+    "paper": TrainOptions(_ANYWHERE, _ANYWHERE, "paper", precision="auto"),
     "cpu": TrainOptions(
         _ANYWHERE,
         _ANYWHERE,
@@ -147,7 +160,7 @@ PRESETS: dict[str, TrainOptions] = {
         steps=1600,
         validate_every=400,
         save_every=100,
-        precision="bfloat16",
+        precision="auto",
     ),
     "tiny": TrainOptions(
         _ANYWHERE,

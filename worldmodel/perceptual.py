@@ -61,7 +61,7 @@ class PerceptualNetwork(nn.Module):
         """Compare pictures.
 
         Args:
-            predicted: (N, 3, H, W), clamped to [0, 1].
+            predicted: (N, 3, H, W), clamped to [0, 1], on any device.
             target: (N, 3, H, W), or (1, 3, H, W) for all of them.
 
         Returns:
@@ -69,6 +69,7 @@ class PerceptualNetwork(nn.Module):
             pixels, summed over the five layers; and (N,) cosine similarity of the features, averaged over pixels and
             layers, 1 for equal pictures.
         """
+        predicted, target = predicted.to(self.shift.device), target.to(self.shift.device)
         one = self.features(target) if len(target) == 1 else None
         parts = []
         for first in range(0, len(predicted), _CHUNK):

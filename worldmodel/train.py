@@ -17,7 +17,7 @@ from envs.errors import UsageError
 from worldmodel.budget import Cost, measure_cost
 from worldmodel.clips import ClipSource
 from worldmodel.config_file import changed, read_config
-from worldmodel.devices import prepare_devices
+from worldmodel.devices import find_device, find_precision, prepare_devices
 from worldmodel.memory import keep_freed_memory
 from worldmodel.models import make_model, named_config
 from worldmodel.options import PRESETS, TrainOptions
@@ -26,7 +26,7 @@ from worldmodel.trainer import Trainer
 from worldmodel.training_data import model_context, open_data
 from worldmodel.validation import ValidationSet
 
-HOW_NOT_WHAT = ("device", "deterministic", "memory_limit")
+HOW_NOT_WHAT = ("device", "deterministic", "memory_limit", "save_every", "log_every")
 """Options that a run may go on with others of."""
 
 
@@ -110,11 +110,13 @@ def existing_run(options: TrainOptions) -> TrainOptions | None:
         before = {"action_column": "action", **json.loads(path.read_text())}  # older runs do not say
         if options.minutes is not None:  # then the number of steps is the run's own
             options = replace(options, steps=int(before["steps"]))
+        if options.precision == "auto":
+            options = replace(options, precision=before["precision"])
     except (ValueError, TypeError, KeyError) as error:
         raise UsageError(f"{path} is damaged ({error}); restore it, or give another --out") from error
     document = document_of(options)
     for name in document:
-        if name not in HOW_NOT_WHAT and before.get(name) != document[name]:
+        if name not in HOW_NOT_WHAT and not _same(name, before.get(name), document[name]):
             raise UsageError(
                 f"{options.out} holds a run with {name} = {before.get(name)}, not {document[name]}; give the same "
                 "options to go on with it, or another --out"
@@ -122,8 +124,16 @@ def existing_run(options: TrainOptions) -> TrainOptions | None:
     return options
 
 
+def _same(name: str, before: Any, now: Any) -> bool:
+    """Whether an option has the same value; a folder may go by several names."""
+    if name in ("data", "validation") and before is not None and now is not None:
+        return Path(before).resolve() == Path(now).resolve()
+    return bool(before == now)
+
+
 def claim(options: TrainOptions) -> TrainOptions:
-    """Write the options beside the run; returns them."""
+    """Write the options beside the run; returns them, with the precision that this machine made of `auto`."""
+    options = replace(options, precision=find_precision(options.precision, find_device(options.device)))
     options.out.mkdir(parents=True, exist_ok=True)
     write_json(options.out / "config.json", document_of(options))
     return options

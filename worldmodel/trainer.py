@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,14 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
+from data_collection.files import written_aside
 from envs.errors import UsageError
 from worldmodel import losses
 from worldmodel.ahead import Ahead
 from worldmodel.checkpoint import load_training, save_model, save_training
 from worldmodel.clips import Clips, ClipSource
 from worldmodel.colour_jitter import ColourJitter
+from worldmodel.devices import find_precision
 from worldmodel.inference import InferenceNetwork, inference_network
 from worldmodel.options import TrainOptions
 from worldmodel.pictures import picture_prediction
@@ -70,7 +73,7 @@ class Trainer:
         self.model, self.options, self.train_clips, self.validation = model, options, train, validation
         self.origin, self.ranks, self.share = origin, ranks, ranks.share(options.batch)
         self.device = model.device
-        model.precision = getattr(torch, options.precision)
+        model.precision = getattr(torch, find_precision(options.precision, self.device))
         self.modules: dict[str, torch.nn.Module] = {"model": model}
         self.inference: InferenceNetwork | None = None
         if model.latent_channels:
@@ -86,7 +89,7 @@ class Trainer:
         self.bad_steps = 0
 
     def run(self, told: Callable[[Scores], None] = lambda scores: None) -> None:
-        """Train to the last step, resuming where the run's folder stands; SIGTERM saves and stops.
+        """Train to the last step, resuming where the run's folder stands; SIGTERM and Ctrl-C save and stop.
 
         Args:
             told: is called with the scores after each validation.
@@ -98,6 +101,8 @@ class Trainer:
             self._check_data(state.get("data"))
         self.ranks.begin_alike(self.parameters, self.step)
         first = self.ranks.first
+        if first:
+            _forget_after(self.step, options.out / "metrics.jsonl")
         writer = SummaryWriter(str(options.out / "tensorboard"), purge_step=self.step) if first else None
         started = time.monotonic()
         base_seconds = self.seconds
@@ -106,7 +111,7 @@ class Trainer:
         bar = tqdm(
             total=options.steps, initial=self.step, desc="train", unit="step", dynamic_ncols=True, disable=not first
         )
-        with _stop_on_sigterm() as stopping:
+        with _stop_signals() as stops:
             while self.step < options.steps:
                 self.model.train()
                 asked = time.monotonic()
@@ -118,7 +123,7 @@ class Trainer:
                 bar.update()
                 bar.set_postfix({k: f"{v:.4f}" for k, v in terms.items() if k in ("loss", "rgb", "depth", "knn")})
                 last = self.step == options.steps
-                stop = self.ranks.any(stopping())
+                stop = self.ranks.any(bool(stops))
                 if writer and (self.step % options.log_every == 0 or last):
                     share = waited / max(time.monotonic() - started, 1e-9)
                     self._log(writer, "train", terms | {"seconds": self.seconds, "data_wait": share})
@@ -135,6 +140,8 @@ class Trainer:
         bar.close()
         if writer:
             writer.close()
+        if signal.SIGINT in stops:
+            raise KeyboardInterrupt
 
     def update(self, clips: Clips) -> dict[str, float]:
         """One step of Adam on a batch of clips; returns the terms of the loss.
@@ -311,6 +318,25 @@ def reconstruction_terms(
     return terms
 
 
+def _forget_after(step: int, path: Path) -> None:
+    """Drop the lines of steps that a killed process took after its last checkpoint: they will be written again."""
+    if not path.exists():
+        return
+    lines = path.read_text().splitlines(keepends=True)
+    kept = [line for line in lines if _step_of(line) <= step]
+    if kept != lines:
+        with written_aside(path) as aside:
+            aside.write_text("".join(kept))
+
+
+def _step_of(line: str) -> float:
+    """Of a line of metrics; inf for one that a kill has torn."""
+    try:
+        return float(json.loads(line)["step"]) if line.endswith("\n") else math.inf
+    except ValueError:
+        return math.inf
+
+
 def _finite(values: Mapping[str, Any]) -> dict[str, Any]:
     """Numbers and lists of them for JSON, which knows no NaN and no infinity: None in their place."""
     return {
@@ -328,15 +354,24 @@ def _mix(seed: int, step: int) -> int:
 
 
 @contextmanager
-def _stop_on_sigterm() -> Iterator[Any]:
-    """Yields a question: has somebody asked us to stop?"""
-    asked: list[int] = []
+def _stop_signals() -> Iterator[list[int]]:
+    """Those by which somebody asks us to stop, as they come: SIGTERM and Ctrl-C. A second one stops us at once."""
+    stops: list[int] = []
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    heard = [number for number, handler in before.items() if handler is not signal.SIG_IGN]
+
+    def hear(number: int, frame: object) -> None:
+        stops.append(number)
+        signal.signal(number, before[number])  # type: ignore[index]
+
     try:
-        before = signal.signal(signal.SIGTERM, lambda number, frame: asked.append(number))
+        for number in heard:
+            signal.signal(number, hear)
     except ValueError:  # not in the main thread: nobody can signal us
-        yield lambda: False
+        yield stops
         return
     try:
-        yield lambda: bool(asked)
+        yield stops
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number in heard:
+            signal.signal(number, before[number])

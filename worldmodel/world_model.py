@@ -124,7 +124,8 @@ class WorldModel(nn.Module, ABC):
         Args:
             rgb: (B, T, 3, H, W) in [0, 1].
             depth: (B, T, 1, H, W) metres; a model of pictures passes it on unseen.
-            actions: (B, T-1, A), the aggregated action between each frame and the next.
+            actions: (B, T-1, A), the aggregated action between each frame and the next; None is for a single frame and
+                for action-free models.
 
         Returns:
             The state at the last frame.
@@ -132,7 +133,7 @@ class WorldModel(nn.Module, ABC):
         memory = self.blank_memory(rgb[:, 0])
         for t in range(rgb.shape[1] - 1):
             action = None if actions is None else actions[:, t]
-            _, memory = self.predict(rgb[:, t], depth[:, t], action, None, memory)
+            _, memory = self.predict(rgb[:, t], depth[:, t], action, None, memory, picture=False)
         return WorldState(rgb[:, -1].float(), depth[:, -1].float(), memory)
 
     def step(
@@ -147,7 +148,7 @@ class WorldModel(nn.Module, ABC):
 
         Args:
             state: of a batch of B, or of 1 from which all actions start.
-            action: (B, A) in the dataset's units.
+            action: (B, A) in the dataset's units; None is for action-free models.
             latent: (B, Z, H/8, W/8), zeros when None.
             paint, picture: see `predict`.
         """
@@ -173,7 +174,7 @@ class WorldModel(nn.Module, ABC):
         Args:
             rgb: (B, 3, H, W) in [0, 1].
             depth: (B, 1, H, W) metres.
-            action: (B, A), aggregated over the frame gap; ignored by an action-free model.
+            action: (B, A), aggregated over the frame gap; None is for action-free models, which ignore it.
             latent: (B, Z, H/8, W/8); zeros when None.
             memory: of the last step, or `blank_memory` at the start.
             still: let nothing move (identity transforms, kernels that copy), to see what is left without motion.
@@ -184,7 +185,13 @@ class WorldModel(nn.Module, ABC):
 
         Returns:
             The prediction and the new memory.
+
+        Raises:
+            UsageError: the model is conditioned on actions, and this is none of its actions.
         """
+        if self.action_dim and (action is None or action.shape[1:] != (self.action_dim,)):
+            given = "none was given" if action is None else f"that given has shape {tuple(action.shape)}"
+            raise UsageError(f"{given}, but the model needs an action (B, {self.action_dim}); see its `context`")
         batch = max(rgb.shape[0], 0 if action is None else len(action), 0 if latent is None else len(latent))
         frame = self.frame(rgb, depth).contiguous(memory_format=torch.channels_last)
         if self.action_dim == 0 or action is None:

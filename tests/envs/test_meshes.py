@@ -45,3 +45,14 @@ def test_a_full_disk_leaves_nothing_behind(pyramid, tmp_path, monkeypatch):
     monkeypatch.setattr(meshes.np, "savez_compressed", full)
     assert len(meshes.light_mesh([pyramid]).faces) == 4
     assert not list((tmp_path / "meshes").iterdir())
+
+
+@pytest.mark.parametrize("left", [0, 100])
+def test_a_damaged_cache_is_made_anew(pyramid, tmp_path, monkeypatch, left):
+    monkeypatch.setenv("T3VIP_CACHE", str(tmp_path))
+    first = meshes.light_mesh([pyramid])
+    (cached,) = (tmp_path / "meshes").iterdir()
+    whole = cached.read_bytes()
+    cached.write_bytes(whole[:left])
+    np.testing.assert_array_equal(meshes.light_mesh([pyramid]).faces, first.faces)
+    assert len(cached.read_bytes()) == len(whole)

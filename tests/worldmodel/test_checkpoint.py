@@ -44,9 +44,9 @@ def test_a_model_comes_back_from_its_folder_and_from_its_run(saved):
         assert loaded.config == model.config and loaded.context == model.context
         assert loaded.camera.to_json() == model.camera.to_json() and loaded.frame_gap == 3 and loaded.action_dim == 7
     assert json.loads((folder / CONFIG).read_text())["origin"] == {"seed": 5}
-    rgb, depth = torch.rand(1, 2, 3, 16, 24), torch.full((1, 2, 1, 16, 24), 2.0)
+    rgb, depth, actions = torch.rand(1, 2, 3, 16, 24), torch.full((1, 2, 1, 16, 24), 2.0), torch.ones(1, 2, 7)
     with torch.no_grad():
-        ours, theirs = (m.step(m.observe(rgb, depth), torch.ones(1, 7))[1] for m in (model, loaded))
+        ours, theirs = (m.step(m.observe(rgb, depth, actions[:, :1]), actions[:, 1])[1] for m in (model, loaded))
     torch.testing.assert_close(ours.rgb, theirs.rgb)
 
 

@@ -146,3 +146,9 @@ def test_a_limit_that_is_none():
     with pytest.raises(UsageError, match="memory-limit is -1"):
         parse_options(["--data", "data", "--out", "out", "--memory-limit", "-1"])
     assert 0 < available_memory() < math.inf
+
+
+def test_files_that_lie_idle_take_no_memory_from_a_container(tmp_path):
+    for name, text in (("max", "3000"), ("current", "2500"), ("stat", "anon 500\ninactive_file 1800\nactive_file 200")):
+        (tmp_path / f"memory.{name}").write_text(f"{text}\n")
+    assert available_memory(tmp_path) == 3000 - (2500 - 1800)

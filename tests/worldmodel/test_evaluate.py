@@ -123,6 +123,8 @@ def test_the_report_says_that_a_model_was_trained_on_the_data(evaluate, make_mod
     assert rate.endswith("was trained on 10") and seen.startswith(f"{name} was trained on this data")
     report = (tmp_path / "out" / "evaluation.md").read_text()
     assert rate in report and seen in report
+    save_model(model, tmp_path / "seen", {"data": {"validation": RGBDDataset(tiny_dataset).content_hash}})
+    assert any(note.startswith(f"{name} was chosen by") for note in evaluate(name)["protocol"]["notes"])
 
 
 def test_one_model_may_be_called_by_either_name():

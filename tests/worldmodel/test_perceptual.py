@@ -72,6 +72,12 @@ def test_reduced_precision_ranks_alike(random_vgg, pictures):
 
 
 @torch.no_grad()
+def test_pictures_come_to_where_the_network_is(random_vgg, pictures):
+    lpips, cosine = PerceptualNetwork(random_vgg).to("meta")(*pictures)
+    assert lpips.is_meta and cosine.is_meta and lpips.shape == cosine.shape == (5,)
+
+
+@torch.no_grad()
 def test_with_the_true_weights(pictures, monkeypatch):
     if not (perceptual_weights.cache_dir() / FILE).exists():
         pytest.skip(f"no {FILE} in the cache folder; evaluate-worldmodel fetches it")

@@ -240,6 +240,13 @@ def test_every_kind_runs_forward_and_backward(make_model, clips, kind):
 
 
 @torch.no_grad()
+def test_what_is_no_action_is_refused(model, clips):
+    state = model.observe(clips.rgb[:, :1], clips.depth[:, :1])
+    for action, words in ((None, "none was given"), (torch.zeros(2, 1), r"has shape \(2, 1\)")):
+        with pytest.raises(UsageError, match=words):
+            model.step(state, action)
+
+
 def test_an_action_free_model_takes_actions_and_ignores_them(make_model, clips):
     model = make_model(act_cond=False)
     state = model.observe(clips.rgb[:, :2], clips.depth[:, :2])

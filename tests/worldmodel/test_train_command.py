@@ -2,7 +2,10 @@
 
 import json
 import multiprocessing
+import os
+import signal
 import time
+from os.path import relpath
 
 import h5py
 import numpy as np
@@ -13,6 +16,7 @@ from safetensors.torch import load_file
 from data_collection.files import locked
 from envs.command import run
 from envs.planar_push.objects import SPLITS
+from worldmodel import devices
 from worldmodel.checkpoint import load_model
 from worldmodel.options import PRESETS, TrainOptions
 from worldmodel.train import _preset, main
@@ -63,7 +67,7 @@ def final_weights(out):
     return load_file(out / "checkpoints" / f"step-{STEPS:08d}" / "training.safetensors")
 
 
-def test_a_run_leaves_metrics_pictures_and_a_model_and_is_then_done(train, tmp_path):
+def test_a_run_leaves_metrics_pictures_and_a_model_and_is_then_done(train, tiny_dataset, tmp_path):
     out, command = tmp_path / "run", ["--steps", 4, "--validate-every", 2, "--save-every", 3, "--batch", 2]
     assert train(*command)[0] == 0
     lines = metrics(out)
@@ -77,11 +81,22 @@ def test_a_run_leaves_metrics_pictures_and_a_model_and_is_then_done(train, tmp_p
     assert origin["options"]["steps"] == 4 and len(origin["data"]["train"]) == 64
     assert not list(out.rglob("*.tmp"))
     assert train(*command)[0] == 0 and metrics(out) == lines  # the same command again has nothing to do
+    assert train(*command, "--data", relpath(tiny_dataset), "--save-every", 1)[0] == 0 and metrics(out) == lines
     assert_one_line(train(*command, "--learning-rate", 0.01), str(out), "learning_rate = 0.001, not 0.01", "--out")
     with locked(out):
         assert_one_line(train(*command), "another process is writing", str(out))
     (out / "config.json").write_text('{"steps": ')
     assert_one_line(train(*command), str(out / "config.json"), "damaged")
+
+
+@pytest.mark.parametrize("best", [torch.float32, torch.bfloat16])
+def test_a_run_keeps_the_precision_that_it_found_best(train, tmp_path, monkeypatch, best):
+    monkeypatch.setattr(devices, "best_precision", lambda device: best)
+    command = ["--precision", "auto", "--steps", 1, "--batch", 1]
+    assert train(*command)[0] == 0
+    monkeypatch.setattr(devices, "best_precision", None)  # nobody asks again
+    assert train(*command)[0] == 0
+    assert json.loads((tmp_path / "run/config.json").read_text())["precision"] == str(best).removeprefix("torch.")
 
 
 def test_t3vip_d_has_no_latents(train, tmp_path):
@@ -108,6 +123,10 @@ def test_a_validation_set_of_its_own(train, write_dataset, tmp_path):
         (["--seed", "-1"], ["seed is -1", "0 or more"]),
         (["--context", "4"], ["context is 4", "1 to 3"]),
         (["--losses.knn", "-1"], ["knn is -1.0", "give 0"]),
+        (["--losses.rgb", "nan"], ["rgb is nan", "give 0"]),
+        (["--schedule.final-rate", "-2"], ["final-rate is -2.0", "from 0 to 1"]),
+        (["--schedule.truth-until", "-1"], ["truth-until is -1.0", "0 or more"]),
+        (["--schedule.kl-ramp", "0.6", "0.5"], ["kl-ramp is (0.6, 0.5)", "the earlier one first"]),
         (["--architecture.masks", "1"], ["masks is 1", "at least 2"]),
         (["--architecture.lstm-kernel", "4"], ["lstm-kernel is 4", "odd"]),
         (["--device", "abacus"], ["abacus", "cpu or cuda"]),
@@ -164,6 +183,12 @@ def test_data_that_does_not_do(train, write_dataset, camera_of, tmp_path):
     assert not (tmp_path / "run" / "metrics.jsonl").exists()
 
 
+def in_the_foreground(line):
+    """Ctrl-C reaches it, also where whoever runs the tests does not want to hear of Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    run(TrainOptions, main, line, _preset)
+
+
 @pytest.fixture(scope="module")
 def start(tiny_dataset):
     """Starts the long run in a process of its own, forked from one that has imported everything."""
@@ -174,7 +199,7 @@ def start(tiny_dataset):
 
         def begin(out):
             line = ["--preset", "tiny", "--data", tiny_dataset, "--out", out, *LONG_RUN]
-            process = context.Process(target=run, args=(TrainOptions, main, list(map(str, line)), _preset))
+            process = context.Process(target=in_the_foreground, args=(list(map(str, line)),))
             process.start()
             return process
 
@@ -205,12 +230,14 @@ def assert_same(ours, theirs):
         assert torch.equal(value, theirs[name]), name
 
 
-def test_sigterm_saves_and_the_same_command_goes_on(start, undisturbed, tmp_path):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_who_is_asked_to_stop_saves_and_the_same_command_goes_on(start, undisturbed, tmp_path, number, code):
     out = tmp_path / "run"
     process = start(out)
     wait_for_step(process, out, SAVE_EVERY + 2)
-    process.terminate()
-    finish(process)
+    os.kill(process.pid, number)
+    process.join()
+    assert process.exitcode == code
     stopped = saved_step(out)
     assert SAVE_EVERY + 2 <= stopped == logged_step(out) < STEPS  # not one step is lost
     finish(start(out))
@@ -233,5 +260,6 @@ def test_sigkill_costs_at_most_the_steps_since_the_last_checkpoint(start, undist
         if (out / "model").exists():
             load_model(out)
     finish(start(out))
+    assert [line["step"] for line in metrics(out) if line["kind"] == "train"] == list(range(1, STEPS + 1))  # each once
     assert_same(final_weights(out), undisturbed)
     load_model(out)

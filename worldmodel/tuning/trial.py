@@ -48,10 +48,10 @@ def run_trial(
     point = {name: value for name, value in config.items() if name != "number"}
     options = replace(at_point(training, point), out=training.out / f"{config['number']:03d}")
     try:
-        existing_run(options) or claim(options)
+        options = existing_run(options) or claim(options)
     except UsageError:  # the folder holds another configuration: the search has lost its state and drew anew
         shutil.rmtree(options.out)
-        claim(options)
+        options = claim(options)
     trainer = make_trainer(options, *data, Ranks(device=find_device(options.device)))
 
     def tell(scores: Scores) -> None:
