@@ -150,6 +150,7 @@ def nearest_of_all(query: Tensor, reference: Tensor) -> Tensor:
         return torch.cat(nearest).view(batch, height, width)
 
 
+@compiled
 def _mean_distance(query: Tensor, reference: Tensor, nearest: Tensor) -> Tensor:
     """Mean distance of each query point to the reference point with its index (B, H, W), metres."""
     index = nearest.flatten(1).unsqueeze(1).expand(-1, 3, -1)

@@ -90,6 +90,16 @@ def test_compiled_search_is_the_plain_one():
         assert torch.equal(losses.nearest_of_all(query, reference), everywhere)
 
 
+@pytest.mark.skipif(not can_compile(), reason="no C++ compiler")
+def test_compiled_alignment_has_the_gradient_of_the_plain_one():
+    moved, target = (cloud.float().requires_grad_() for cloud in clouds(3, 6, 8, 1))
+    (plain,) = torch.autograd.grad(losses.knn_alignment(moved, target.detach(), 2), moved)
+    with torch.compiler.set_stance("default"):
+        (compiled,) = torch.autograd.grad(losses.knn_alignment(moved, target.detach(), 2), moved)
+    assert plain.abs().max() > 1e-4
+    torch.testing.assert_close(compiled, plain, rtol=1e-4, atol=1e-7)
+
+
 @pytest.mark.parametrize(("power", "expected"), [(1, 1.5), (2, 2.5)])
 def test_reconstruction(power, expected):
     assert float(losses.reconstruction(torch.tensor([1.0, -1.0]), torch.tensor([0.0, 1.0]), power)) == expected
