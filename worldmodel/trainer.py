@@ -7,8 +7,7 @@ import logging
 import math
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,7 @@ from worldmodel.pictures import picture_prediction
 from worldmodel.ranks import ALONE, Ranks
 from worldmodel.rollout import Rollout, unroll
 from worldmodel.scores import number
+from worldmodel.stopping import stop_signals
 from worldmodel.t3vip import T3VIP
 from worldmodel.validation import Scores, ValidationSet, summary, validate
 from worldmodel.world_model import WorldModel
@@ -111,7 +111,7 @@ class Trainer:
         bar = tqdm(
             total=options.steps, initial=self.step, desc="train", unit="step", dynamic_ncols=True, disable=not first
         )
-        with _stop_signals() as stops:
+        with stop_signals() as stops:
             while self.step < options.steps:
                 self.model.train()
                 asked = time.monotonic()
@@ -351,27 +351,3 @@ def _ramp(x: float, low: float, high: float) -> float:
 
 def _mix(seed: int, step: int) -> int:
     return int(np.random.SeedSequence((seed, step, 1)).generate_state(1, np.uint64)[0]) >> 1
-
-
-@contextmanager
-def _stop_signals() -> Iterator[list[int]]:
-    """Those by which somebody asks us to stop, as they come: SIGTERM and Ctrl-C. A second one stops us at once."""
-    stops: list[int] = []
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-    heard = [number for number, handler in before.items() if handler is not signal.SIG_IGN]
-
-    def hear(number: int, frame: object) -> None:
-        stops.append(number)
-        signal.signal(number, before[number])  # type: ignore[index]
-
-    try:
-        for number in heard:
-            signal.signal(number, hear)
-    except ValueError:  # not in the main thread: nobody can signal us
-        yield stops
-        return
-    try:
-        yield stops
-    finally:
-        for number in heard:
-            signal.signal(number, before[number])

@@ -8,14 +8,13 @@ losses of each step and in the end their greatest relative difference.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
 from data_collection.dataset import RGBDDataset
+from envs import command as command_line
 from tests.benchmarks.plain import plain_operators
 from tests.benchmarks.subjects.training import make_trainer
 from worldmodel.clips import ClipSource
@@ -26,13 +25,20 @@ EPISODES = slice(0, 40)
 FRAMES = 12
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+@dataclass(frozen=True)
+class PrecisionOptions:
+    """How far does the fast training program stray from the plain one?"""
+
+    data: Path
+    """Dataset whose clips both train on."""
+    steps: int = 50
+    """Updates of the weights."""
+    batch: int = 16
+    """Clips a step."""
+
+
+def main(options: PrecisionOptions) -> None:
     """Train both, a step each in turn."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=50)
-    parser.add_argument("--batch", type=int, default=16)
-    options = parser.parse_args(arguments)
     source = ClipSource(RGBDDataset(options.data), PRESETS["cpu"].frame_gap, EPISODES)
     fast, plain = (_trainer(kind, source, options.batch) for kind in ("ours", "plain"))
     greatest = 0.0
@@ -57,4 +63,4 @@ def _trainer(kind: str, source: ClipSource, batch: int) -> Trainer:
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(PrecisionOptions, main)
