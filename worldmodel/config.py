@@ -9,6 +9,7 @@ from envs.errors import UsageError
 from worldmodel.splatting import SplatMode
 
 LatentKind = Literal["none", "step", "clip"]
+Evidence = Literal["changes", "frames"]
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,9 @@ class ModelConfig:
     """Of CDNA, SNA and SV2P: width of the kernels in pixels, 5 in the originals."""
     latents: LatentKind = "step"
     """One latent a step, one a clip, or none; CDNA, SNA and T3VIP-D have none in any case."""
+    inferred_from: Evidence = "changes"
+    """What the inference network sees: how each frame differs from the clip's mean, or the frames themselves, as in the
+    paper. Of frames nearly all stands still; latents inferred from them came to carry nothing."""
     act_cond: bool = True
     """Whether the model sees actions."""
     splat: SplatMode = "over"
