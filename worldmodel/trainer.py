@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from data_collection.files import written_aside
 from envs.errors import UsageError
 from worldmodel import losses
 from worldmodel.ahead import Ahead
@@ -27,13 +23,13 @@ from worldmodel.clips import Clips, ClipSource
 from worldmodel.colour_jitter import ColourJitter
 from worldmodel.devices import find_precision
 from worldmodel.inference import InferenceNetwork, inference_network
+from worldmodel.journal import Journal, finite
+from worldmodel.objective import reconstruction_terms
 from worldmodel.options import TrainOptions
 from worldmodel.pictures import picture_prediction
 from worldmodel.ranks import ALONE, Ranks
-from worldmodel.rollout import Rollout, unroll
-from worldmodel.scores import number
+from worldmodel.rollout import unroll
 from worldmodel.stopping import stop_signals
-from worldmodel.t3vip import T3VIP
 from worldmodel.validation import Scores, ValidationSet, summary, validate
 from worldmodel.world_model import WorldModel
 
@@ -101,9 +97,7 @@ class Trainer:
             self._check_data(state.get("data"))
         self.ranks.begin_alike(self.parameters, self.step)
         first = self.ranks.first
-        if first:
-            _forget_after(self.step, options.out / "metrics.jsonl")
-        writer = SummaryWriter(str(options.out / "tensorboard"), purge_step=self.step) if first else None
+        journal = Journal(options.out, self.step) if first else None
         started = time.monotonic()
         base_seconds = self.seconds
         waited = 0.0
@@ -124,22 +118,22 @@ class Trainer:
                 bar.set_postfix({k: f"{v:.4f}" for k, v in terms.items() if k in ("loss", "rgb", "depth", "knn")})
                 last = self.step == options.steps
                 stop = self.ranks.any(bool(stops))
-                if writer and (self.step % options.log_every == 0 or last):
+                if journal and (self.step % options.log_every == 0 or last):
                     share = waited / max(time.monotonic() - started, 1e-9)
-                    self._log(writer, "train", terms | {"seconds": self.seconds, "data_wait": share})
-                if writer and (self.step % options.validate_every == 0 or last):
-                    scores = self.score(writer)
+                    journal.write("train", self.step, terms | {"seconds": self.seconds, "data_wait": share})
+                if journal and (self.step % options.validate_every == 0 or last):
+                    scores = self.score(journal)
                     bar.write(f"step {self.step}: {summary(scores)}")
                     told(scores)
-                if writer and (self.step % options.save_every == 0 or last or stop):
+                if journal and (self.step % options.save_every == 0 or last or stop):
                     self.save()
                 if stop:
-                    if writer:
+                    if journal:
                         bar.write(f"stopped at step {self.step}; the same command goes on from here")
                     break
         bar.close()
-        if writer:
-            writer.close()
+        if journal:
+            journal.close()
         if signal.SIGINT in stops:
             raise KeyboardInterrupt
 
@@ -250,10 +244,10 @@ class Trainer:
         each = len(draws) // self.ranks.count
         return draws[self.ranks.index * each :][:each].to(self.device)
 
-    def score(self, writer: SummaryWriter) -> Scores:
+    def score(self, journal: Journal) -> Scores:
         """Validate, draw a picture, and keep the model if it is the best so far."""
         scores = validate(self.model, self.validation)
-        self._log(writer, "validation", scores)
+        journal.write("validation", self.step, scores)
         clips, starts = next(self.validation.batches())
         truth = None
         if self.validation.source.dataset.has_ground_truth:
@@ -263,7 +257,7 @@ class Trainer:
         score = float(scores["score"])  # type: ignore[arg-type]
         if score >= self.best:
             self.best = score
-            origin = self.origin | {"step": self.step, "seconds": round(self.seconds), "validation": _finite(scores)}
+            origin = self.origin | {"step": self.step, "seconds": round(self.seconds), "validation": finite(scores)}
             save_model(self.model, self.options.out / "model", origin, self.inference)
         return scores
 
@@ -281,67 +275,6 @@ class Trainer:
                 f"the data has changed since step {self.step} of {self.options.out} ({changed}); restore it, or give "
                 "another --out"
             )
-
-    def _log(self, writer: SummaryWriter, kind: str, values: dict[str, Any]) -> None:
-        with (self.options.out / "metrics.jsonl").open("a") as file:
-            file.write(json.dumps({"kind": kind, "step": self.step, **_finite(values)}, allow_nan=False) + "\n")
-        for name, value in values.items():
-            numbers = value if isinstance(value, list) else [value]
-            writer.add_scalar(f"{kind}/{name}", numbers[-1], self.step)
-
-
-def reconstruction_terms(
-    model: WorldModel, rollout: Rollout, clips: Clips, weights: losses.LossWeights
-) -> dict[str, Tensor]:
-    """All terms but the KL, over all predictions of a rollout at once; a term of weight 0 is left out.
-
-    A model of pictures has the first of them only.
-    """
-    terms: dict[str, Tensor] = {}
-    if weights.rgb:
-        terms["rgb"] = losses.reconstruction(rollout.stack("rgb"), clips.rgb[:, 1:], weights.power)
-    if not isinstance(model, T3VIP):
-        return terms
-    if weights.depth:
-        terms["depth"] = losses.reconstruction(rollout.stack("depth"), clips.depth[:, 1:], weights.power)
-    if weights.knn:
-        target = clips.depth[:, 1:] * model.rays
-        moved = rollout.stack("moved_points")
-        terms["knn"] = losses.alignment(moved.flatten(0, 1), target.flatten(0, 1), weights)
-    pictures = rollout.input_rgb.detach().flatten(0, 1)
-    if weights.scene_smoothness:
-        flow = rollout.stack("scene_flow").flatten(0, 1)
-        terms["scene_smoothness"] = losses.edge_aware_smoothness(flow, pictures)
-    if weights.optical_smoothness:
-        flow = rollout.stack("optical_flow").flatten(0, 1)
-        terms["optical_smoothness"] = losses.edge_aware_smoothness(flow, pictures)
-    return terms
-
-
-def _forget_after(step: int, path: Path) -> None:
-    """Drop the lines of steps that a killed process took after its last checkpoint: they will be written again."""
-    if not path.exists():
-        return
-    lines = path.read_text().splitlines(keepends=True)
-    kept = [line for line in lines if _step_of(line) <= step]
-    if kept != lines:
-        with written_aside(path) as aside:
-            aside.write_text("".join(kept))
-
-
-def _step_of(line: str) -> float:
-    """Of a line of metrics; inf for one that a kill has torn."""
-    try:
-        return float(json.loads(line)["step"]) if line.endswith("\n") else math.inf
-    except ValueError:
-        return math.inf
-
-
-def _finite(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Numbers and lists of them for JSON, which knows no NaN and no infinity: None in their place."""
-    return {
-        name: [number(v) for v in value] if isinstance(value, list) else number(value) for name, value in values.items()
-    }
 
 
 def _ramp(x: float, low: float, high: float) -> float:

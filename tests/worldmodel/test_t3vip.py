@@ -8,8 +8,8 @@ from envs.errors import UsageError
 from worldmodel.clips import Clips
 from worldmodel.inference import InferenceNetwork
 from worldmodel.losses import LossWeights
+from worldmodel.objective import reconstruction_terms
 from worldmodel.rollout import unroll
-from worldmodel.trainer import reconstruction_terms
 
 
 @pytest.fixture(scope="module")
