@@ -5,13 +5,13 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torch.utils.tensorboard import SummaryWriter
-
 from envs.errors import UsageError
+from worldmodel.journal import Journal
 from worldmodel.options import Schedule, TrainOptions
 from worldmodel.trainer import Trainer
 
@@ -58,12 +58,12 @@ def measure_cost(make_trainer: Callable[[TrainOptions], Trainer], options: Train
     with tempfile.TemporaryDirectory() as folder:
         trial = make_trainer(replace(options, out=Path(folder), steps=TRIAL_STEPS))
         step = sum((end - start) * _step_seconds(trial, 0.5 * (start + end)) for start, end in _parts(options.schedule))
-        with SummaryWriter(folder) as writer:
+        with closing(Journal(Path(folder), 0)) as journal:
             whole = trial.validation
             trial.validation = replace(whole, clips=min(whole.clips, whole.batch))
-            trial.score(writer)
+            trial.score(journal)
             trial.validation = whole
-            validation = _seconds(lambda: trial.score(writer))
+            validation = _seconds(lambda: trial.score(journal))
         trial.save()
         return Cost(step, validation, _seconds(trial.save))
 
