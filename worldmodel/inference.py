@@ -12,11 +12,11 @@ from worldmodel.trunk import scaled
 from worldmodel.world_model import WorldModel
 
 CONTRAST = 4.0
-"""Changes are this much enlarged, or the first convolution's bias would drown them."""
+"""Changes are this much enlarged: they are small beside the first convolution's bias."""
 LOG_VARIANCES = (-10.0, 2.0)
-"""Bounds: until the KL sets in, nothing else keeps a noise that the generator has learned to ignore from growing."""
+"""Bounds: until the KL sets in, nothing else keeps a noise that the generator ignores from growing, and it did grow."""
 FIRST_LOG_VARIANCE = -3.0
-"""Of an untrained network: latents say something from the start, or the generator learns not to listen."""
+"""Of an untrained network: its means are then larger than its noise."""
 
 
 class InferenceNetwork(nn.Module):
