@@ -35,7 +35,7 @@ demo: setup
 	@echo "prediction  $(DEMO)/prediction.png, $(DEMO)/prediction.mp4"
 
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 lint: setup
 	$(BIN)/ruff check .

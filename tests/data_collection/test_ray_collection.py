@@ -3,7 +3,6 @@
 import os
 import signal
 import socket
-import time
 from pathlib import Path
 from unittest import mock
 
@@ -80,22 +79,21 @@ def test_the_command_makes_the_same_files_and_survives_a_process_that_dies(clust
 
 
 class Watched(RayPool):
-    """Remembers whom it hired, and waits until the first two have been placed."""
+    """Remembers whom it hired, and takes a machine from the cluster once the worker on it has begun an episode."""
 
-    def __init__(self, *arguments):
+    def __init__(self, cluster, doomed, *arguments):
         super().__init__(*arguments)
-        self.hired = []
+        self.cluster, self.doomed, self.hired = cluster, doomed, []
 
     def hire(self, name, episode):
         self.hired.append(super().hire(name, episode))
         return self.hired[-1]
 
     def wait(self, crew):
-        while not all(worker.place for worker in self.hired[:2]):
-            time.sleep(0.05)
-            for worker in self.hired[:2]:
-                if not worker.place:
-                    worker.news()
+        if self.doomed in self.cluster.worker_nodes:
+            begun = [worker for worker in self.hired if worker.place and len(worker._asked) == 1]
+            if any(worker.place.endswith(self.doomed.node_id[:8]) for worker in begun):
+                self.cluster.remove_node(self.doomed, allow_graceful=False)
         return super().wait(crew)
 
 
@@ -107,13 +105,10 @@ def test_a_machine_that_dies_costs_the_episode_in_flight(cluster, tmp_path):
     assert all(isinstance(e, Collected) for e in collect_episodes(ProcessPool(manifest, here, 300), here, range(5), 1))
     (doomed,) = cluster.worker_nodes
     with connect(cluster.address, None):
-        pool, events = Watched(manifest, there, 300), []
-        for event in collect_episodes(pool, there, range(5), 2):
-            events.append(event)
-            if doomed in cluster.worker_nodes:
-                nodes = [worker.place.split("node ")[-1] for worker in pool.hired]
-                assert sorted(nodes) == sorted(n.node_id[:8] for n in (cluster.head_node, doomed))  # one on each
-                cluster.remove_node(doomed, allow_graceful=False)
+        pool = Watched(cluster, doomed, manifest, there, 300)
+        events = list(collect_episodes(pool, there, range(5), 2))
+        nodes = {worker.place.split("node ")[-1] for worker in pool.hired[:2]}
+        assert nodes == {node.node_id[:8] for node in (cluster.head_node, doomed)}  # one on each
     assert doomed not in cluster.worker_nodes
     lost = [event for event in events if isinstance(event, WorkerLost)]
     assert len(lost) == 1 and doomed.node_id[:8] in lost[0].worker, lost
