@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
 from unittest import mock
 
 import torch
@@ -12,23 +14,38 @@ from torch.nn import functional as F
 
 from worldmodel import geometry, losses
 from worldmodel.blocks import LSTMState
-from worldmodel.t3vip import T3VIP, Heads
-from worldmodel.world_model import Memory
+from worldmodel.kernels import CDNA
+from worldmodel.t3vip import T3VIP
+from worldmodel.world_model import Memory, WorldModel
 
 BEYOND_M = 1e4  # where the cloud ends: farther away than any true neighbour
 
 
-class PlainT3VIP(T3VIP):
-    """The same network in PyTorch's default memory layout."""
+class DefaultLayout(WorldModel):
+    """Before a model's class: the same network in PyTorch's default memory layout."""
 
     def network(
         self, frame: Tensor, action: Tensor, latent: Tensor | None, states: list[LSTMState], paint: bool
-    ) -> tuple[Heads, list[LSTMState]]:
-        return super().network(frame.contiguous(), action, latent, states, paint)
+    ) -> tuple[Any, list[LSTMState]]:
+        found: tuple[Any, list[LSTMState]] = super().network(  # type: ignore[safe-super]  # that of the model's class
+            frame.contiguous(), action, latent, states, paint
+        )
+        return found
 
     def blank_memory(self, like: Tensor) -> Memory:
-        states = super().blank_memory(like).states
-        return Memory([(hidden.contiguous(), cell.contiguous()) for hidden, cell in states])
+        memory = super().blank_memory(like)
+        return replace(memory, states=[(hidden.contiguous(), cell.contiguous()) for hidden, cell in memory.states])
+
+
+class PlainT3VIP(DefaultLayout, T3VIP):
+    pass
+
+
+class PlainCDNA(DefaultLayout, CDNA):
+    pass
+
+
+PLAIN: dict[str, type[WorldModel]] = {plain.kind: plain for plain in (PlainT3VIP, PlainCDNA)}
 
 
 @contextlib.contextmanager

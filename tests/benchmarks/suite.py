@@ -89,6 +89,15 @@ def train_step(quick: bool) -> Result:
     return cost("train_step", _our_training(quick)["update"], "s", plain["update"], what)
 
 
+def cdna_step(quick: bool) -> Result:
+    """An update of CDNA at full width, kernels of 5 x 5: 16 clips of 12 frames."""
+    size: Size = {"width": 0.25, "frames": 3, "repeats": 1} if quick else {"width": 1.0, "frames": 12, "repeats": 5}
+    ours, plain = (
+        measure("training.cdna_step_seconds", kind=kind, preset=_preset(quick), **size) for kind in ("ours", "plain")
+    )
+    return cost("cdna_step", ours, "s", plain, "the same network in fp32, default layout, eager")
+
+
 def data_wait(quick: bool) -> Result:
     """What share of a training step goes into waiting for its clips."""
     ours = _our_training(quick)
@@ -124,6 +133,7 @@ BENCHMARKS: dict[str, Callable[[bool], Result]] = {
         knn_against_chamfer_memory,
         splat,
         train_step,
+        cdna_step,
         data_wait,
         plan_action,
         best_of_100,

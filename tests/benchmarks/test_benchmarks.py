@@ -109,3 +109,12 @@ def test_plain_training_step_has_the_same_losses():
     assert set(terms["ours"]) > {"rgb", "depth", "knn", "scene_smoothness", "optical_smoothness", "kl"}
     for name, value in terms["ours"].items():
         np.testing.assert_allclose(terms["plain"][name], value, rtol=2e-3, err_msg=name)
+
+
+def test_plain_cdna_has_the_same_losses():
+    terms = {}
+    for kind in ("ours", "plain"):
+        trainer = make_trainer(kind, "tiny", model="cdna", batch=2, precision="float32")
+        terms[kind] = trainer.objective(trainer.next_clips())[1]
+    assert terms["ours"].keys() == terms["plain"].keys() == {"loss", "rgb"}
+    np.testing.assert_allclose(terms["plain"]["rgb"], terms["ours"]["rgb"], rtol=2e-3)

@@ -12,12 +12,12 @@ import torch
 
 from data_collection.schema import dequantise_depth
 from envs.camera import CameraModel
-from tests.benchmarks.plain import PlainT3VIP, plain_operators
+from tests.benchmarks.plain import PLAIN, plain_operators
 from tests.benchmarks.timing import median_seconds
 from worldmodel.clips import ClipSource
 from worldmodel.config import ModelContext
+from worldmodel.models import make_model, named_config
 from worldmodel.options import PRESETS, TrainOptions
-from worldmodel.t3vip import T3VIP
 from worldmodel.trainer import Trainer
 
 SIZE, NEAR, FAR = 64, 3.4, 6.3  # the tabletop's, pixels and metres
@@ -26,25 +26,43 @@ LATE = 0.9  # of the run: clips at full length, no true frames, latents from the
 
 
 def step_seconds(kind: str, preset: str, repeats: int) -> dict[str, float]:
-    """Median seconds of an update ("update"), and of waiting for its clips ("wait")."""
+    """Median seconds of an update of T3VIP ("update"), and of waiting for its clips ("wait")."""
     trainer = make_trainer(kind, preset)
     clips = trainer.next_clips()
     trainer.model.train()
-    with plain_operators() if kind == "plain" else contextlib.nullcontext():
+    with as_plainly(kind), plain_operators() if kind == "plain" else contextlib.nullcontext():
         update = median_seconds(lambda: trainer.update(clips), repeats)
     return {"update": update, "wait": median_seconds(trainer.next_clips, repeats)}
 
 
+def cdna_step_seconds(kind: str, preset: str, width: float, frames: int, repeats: int) -> float:
+    """Median seconds of an update of CDNA, kernels of 5 x 5 as in the original."""
+    options = PRESETS[preset]
+    architecture = replace(options.architecture, width=width, kernel_size=5)
+    schedule = replace(options.schedule, clip_lengths=((1.0, frames),))
+    trainer = make_trainer(kind, preset, model="cdna", architecture=architecture, schedule=schedule)
+    clips = trainer.next_clips()
+    trainer.model.train()
+    with as_plainly(kind):
+        return median_seconds(lambda: trainer.update(clips), repeats)
+
+
+def as_plainly(kind: str) -> contextlib.AbstractContextManager[object]:
+    """Within the block nothing is compiled that is "plain"."""
+    return torch.compiler.set_stance("force_eager") if kind == "plain" else contextlib.nullcontext()
+
+
 def make_trainer(kind: str, preset: str, **changes: Any) -> Trainer:
-    """A trainer late in its run: "ours" as `train-worldmodel` makes it, or "plain": fp32, eager, default layout."""
+    """A trainer late in its run: "ours" as `train-worldmodel` makes it, or "plain": fp32, default layout."""
     options: TrainOptions = replace(PRESETS[preset], data=Path("unused"), out=Path("unused"), **changes)
     torch.manual_seed(options.seed)
-    context = _context(options.frame_gap)
+    name, architecture = named_config(options.model, options.architecture)
+    options, context = replace(options, architecture=architecture), _context(options.frame_gap)
     if kind == "plain":
         options = replace(options, precision="float32")
-        model: T3VIP = PlainT3VIP(options.architecture, context)
+        model = PLAIN[name](architecture, context)
     else:
-        model = T3VIP(options.architecture, context).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        model = make_model(name, architecture, context).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     source = ClipSource(MadeUpDataset(), options.frame_gap)  # type: ignore[arg-type]
     trainer = Trainer(model, options, source, None, {})  # type: ignore[arg-type]  # nothing is validated
     trainer.step = round(LATE * options.steps)
