@@ -14,7 +14,7 @@ from envs.errors import UsageError
 from planning.effectors import Effector, Observation
 from planning.goals import Goal
 from planning.point_tracker import PointTracker
-from worldmodel.tracking import HAND_RADIUS, LEAST_FOREGROUND, hand_pixels
+from worldmodel.tracking import HAND_RADIUS, HandTrack, SurfaceTrack, Track, hand_pixels
 
 Array = NDArray[np.float64]
 
@@ -38,11 +38,9 @@ class Follower(ABC):
 
     Attributes:
         point: (3,) metres, world frame, where the point is now.
-        least_foreground: `least` of `worldmodel.tracking.HandTrack` for this body.
     """
 
     point: Array
-    least_foreground: float
 
     @abstractmethod
     def reset(self, observation: Observation, goal: Goal) -> None:
@@ -56,6 +54,11 @@ class Follower(ABC):
     def pixels(self, observation: Observation, camera: CameraModel) -> torch.Tensor:
         """The pixels (M,) int64, counted row by row, that show the body of the point in the last observation."""
 
+    @staticmethod
+    @abstractmethod
+    def track(body: torch.Tensor, point: torch.Tensor, K: torch.Tensor, futures: int) -> Track:
+        """The point (3,), by what those pixels show (M, 3), in N futures; camera frame, metres. `K`: intrinsics."""
+
 
 class EffectorFollower(Follower):
     """The point is the end-effector's own: proprioception says where it is.
@@ -66,8 +69,6 @@ class EffectorFollower(Follower):
         effector: whose.
         radius: metres around the point that are taken for the end-effector.
     """
-
-    least_foreground = LEAST_FOREGROUND
 
     def __init__(self, effector: Effector, radius: float = HAND_RADIUS) -> None:
         self.effector, self.radius = effector, radius
@@ -85,19 +86,18 @@ class EffectorFollower(Follower):
         tcp = camera.to_camera(self.effector.position(observation)).astype(np.float32)
         return hand_pixels(seen, torch.as_tensor(tcp), self.radius)
 
+    @staticmethod
+    def track(body: torch.Tensor, point: torch.Tensor, K: torch.Tensor, futures: int) -> Track:
+        return HandTrack(point.expand(futures, 3), body.expand(futures, *body.shape), K)
+
 
 class SurfaceFollower(Follower):
     """The point lies on a thing and is followed by its looks.
-
-    A thing may stand still while the end-effector moves beside it: what little of that is blended into the thing's
-    pixels must not be taken for its motion.
 
     Args:
         camera: that takes the frames.
         surface: of the thing.
     """
-
-    least_foreground = 1.0
 
     def __init__(self, camera: CameraModel, surface: Surface) -> None:
         self.camera, self.surface = camera, surface
@@ -122,3 +122,7 @@ class SurfaceFollower(Follower):
             for i, size in ((0, camera.width), (1, camera.height))
         )
         return torch.as_tensor(np.unique(v * camera.width + u))
+
+    @staticmethod
+    def track(body: torch.Tensor, point: torch.Tensor, K: torch.Tensor, futures: int) -> Track:
+        return SurfaceTrack.start(body, point, K, futures)

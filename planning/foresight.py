@@ -14,7 +14,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
-from torch import Tensor
 from tqdm import tqdm
 
 from data_collection.files import write_json
@@ -27,6 +26,7 @@ from planning.controllers.t3vip import T3VIPController
 from planning.episode import mark_of
 from planning.marks import point_position
 from planning.tasks import TASKS
+from worldmodel.tracking import Track
 
 Array = NDArray[np.float64]
 WAYS = ((0.0, 0.001), (0.001, 0.02), (0.02, 0.05), (0.05, np.inf))
@@ -76,7 +76,7 @@ class Onlooker(T3VIPController):
     """
 
     told: NDArray[np.float32]
-    foresee: Callable[[NDArray], Tensor]
+    foresee: Callable[[NDArray], list[Track]]
 
     def decide(self, observation: Observation) -> NDArray:
         self.watch(observation)
@@ -93,11 +93,10 @@ class Comparison:
     foreseen: list[Array] = field(default_factory=list)
     rank_correlations: list[float] = field(default_factory=list)
 
-    def add(self, start: Array, true: Array, foreseen_start: Array, foreseen: Array, goal: Array) -> None:
-        """Of one decision: places (N, h, 3) of the point, and where each side takes it to be now."""
-        self.true.append(true[:, -1] - start)
-        self.foreseen.append(foreseen[:, -1] - foreseen_start)
-        costs = [np.linalg.norm(places - goal, axis=-1).mean(axis=1) for places in (true, foreseen)]
+    def add(self, true: Array, foreseen: Array, costs: tuple[Array, Array]) -> None:
+        """Of one decision: ways (N, 3) of the point, and costs (N,), true and foreseen."""
+        self.true.append(true)
+        self.foreseen.append(foreseen)
         if min(cost.std() for cost in costs) > LEAST_SPREAD:
             self.rank_correlations.append(float(spearmanr(*costs).statistic))
 
@@ -155,9 +154,11 @@ def compare(config: Config) -> dict[str, Any]:
                     plans = random_plans(rng, config.plans, task.planner.horizon, task.body.axes, task.body.limit)
                     held = np.repeat(oracle.effector.action(plans), hold, axis=1)
                     true = kit.simulator.paths(kit.simulator.state(), held, kit.mark).point[:, hold - 1 :: hold]
-                    foreseen = kit.camera.to_world(onlooker.foresee(plans).cpu().numpy().astype(float))
-                    start = point_position(env, kit.mark)
-                    found.add(start, true, onlooker.follower.point, foreseen, goal)
+                    tracks, towards = onlooker.foresee(plans), onlooker.in_camera(goal)
+                    end = kit.camera.to_world(tracks[-1].expected_position().cpu().numpy().astype(float))
+                    distances = [track.expected_distance(towards).cpu().numpy() for track in tracks]
+                    costs = np.linalg.norm(true - goal, axis=-1).mean(axis=1), np.mean(distances, axis=0)
+                    found.add(true[:, -1] - point_position(env, kit.mark), end - onlooker.follower.point, costs)
                 observation, *_ = env.step(action)
     finally:
         kit.close()

@@ -70,7 +70,7 @@ TASKS: dict[tuple[str, str], Task] = {
     ("planar-push", "object"): Task(
         "t3vip/PlanarPush-v0", ("test", "validation", "train", "all"), make_push_setup, "push {scene} objects",
         scene_keyword="split", body=Tip, surface=Surface(extent=0.08, step=0.01, colour=1.0, radius=0.025),
-        reach=Reach(0.15, 0.1), planner=ICEMConfig(horizon=6), zoom=1.5,
+        reach=Reach(0.5, 0.1), planner=ICEMConfig(horizon=6), zoom=1.5,
     ),
 }  # fmt: skip
 """Environment and point -> the task; the first point of an environment is the usual one."""

@@ -18,12 +18,19 @@ from worldmodel.compilation import compiled
 
 def convolve(picture: Tensor, kernels: Tensor) -> Tensor:
     """Each picture with each of its kernels, edges repeated: (B, C, H, W) and (B, K, S, S) to (B, K, C, H, W)."""
-    batch, channels, height, width = picture.shape
+    batch, reach = len(picture), kernels.shape[-1] // 2
+    pictures = picture[:1] if picture.stride(0) == 0 else picture  # expanded from one: nothing to be padded B times
+    padded = F.pad(pictures, (reach,) * 4, mode="replicate")
+    return convolve_padded(padded.expand(batch, -1, -1, -1), kernels)
+
+
+def convolve_padded(padded: Tensor, kernels: Tensor) -> Tensor:
+    """The same for pictures (B, C, H + S - 1, W + S - 1) that have their edges already."""
+    batch, channels, height, width = padded.shape
     count, size = kernels.shape[1], kernels.shape[-1]
-    pictures = 1 if picture.stride(0) == 0 else batch  # expanded from one: a plain convolution, three times as fast
-    padded = F.pad(picture[:pictures], (size // 2,) * 4, mode="replicate").transpose(0, 1)
-    moved = F.conv2d(padded, kernels.flatten(0, 1).unsqueeze(1), groups=pictures)
-    return moved.view(channels, batch, count, height, width).permute(1, 2, 0, 3, 4)
+    pictures = 1 if padded.stride(0) == 0 else batch  # expanded from one: a plain convolution, three times as fast
+    moved = F.conv2d(padded[:pictures].transpose(0, 1), kernels.flatten(0, 1).unsqueeze(1), groups=pictures)
+    return moved.view(channels, batch, count, height - size + 1, width - size + 1).permute(1, 2, 0, 3, 4)
 
 
 def advect(picture: Tensor, masks: Tensor, kernels: Tensor) -> Tensor:

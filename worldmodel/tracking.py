@@ -1,13 +1,16 @@
-"""Following the end-effector through predicted transforms.
+"""Following points through predicted transforms.
 
 The end-effector's point (TCP) lies between the fingers: what the camera sees in its direction is the background, or
 the table. But a rigid transform moves any point of a body. So the TCP is moved by the transform of the *hand pixels*,
-the visible points near it.
+the visible points near it (`HandTrack`).
+
+A point on the surface of a thing is moved as the points around it are, each by its own transform (`SurfaceTrack`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -40,6 +43,24 @@ def hand_pixels(points: Tensor, tcp: Tensor, radius: float = HAND_RADIUS, least:
     return distance.topk(least, largest=False).indices
 
 
+class Track(Protocol):
+    """A point in N imagined futures; camera frame, metres."""
+
+    def advance(self, transform: Tensor, background: Tensor) -> Track:
+        """One predicted step on.
+
+        Args:
+            transform: (N, 3, 4, H, W) blended rigid transform of each pixel, camera frame.
+            background: (N, 1, H, W) the mask of the background, which never moves.
+        """
+
+    def expected_position(self) -> Tensor:
+        """(N, 3)."""
+
+    def expected_distance(self, goal: Tensor) -> Tensor:
+        """(N,), to a goal (3,)."""
+
+
 @dataclass(frozen=True, eq=False)
 class HandTrack:
     """The TCP and the hand's points in N imagined futures; camera frame, metres.
@@ -48,13 +69,11 @@ class HandTrack:
         tcp: (N, 3).
         points: (N, M, 3).
         K: (3, 3) intrinsics, pixel centres at integers.
-        least: below this share of anything that moves, the body counts as still; 1 for blended transforms as they are.
     """
 
     tcp: Tensor
     points: Tensor
     K: Tensor
-    least: float = LEAST_FOREGROUND
 
     @classmethod
     def start(cls, points: Tensor, tcp: Tensor, K: Tensor, futures: int, radius: float = HAND_RADIUS) -> HandTrack:
@@ -73,27 +92,88 @@ class HandTrack:
     def advance(self, transform: Tensor, background: Tensor) -> HandTrack:
         """One predicted step on.
 
-        Reads transforms and background mask where the hand's points project to (between pixels: linearly), and moves
-        the points and the TCP as one body. Among the pixels near the hand some show the table behind it, and the mask
-        of the hand is soft: a plain mean of the transforms would lag behind. The blended transform of a pixel is
-        A = b I + (1 - b) M with b its background mask; so M, the motion of what moves there, is the mean of A - b I
-        over the mean of 1 - b. Where next to nothing moves, M goes over into the identity.
+        Reads transforms and background mask where the hand's points are seen, and moves the points and the TCP as one
+        body. Among the pixels near the hand some show the table behind it, and the mask of the hand is soft: a plain
+        mean of the transforms would lag behind. The blended transform of a pixel is A = b I + (1 - b) M with b its
+        background mask; so M, the motion of what moves there, is the mean of A - b I over the mean of 1 - b. Where next
+        to nothing moves, M goes over into the identity.
 
         Args:
             transform: (N, 3, 4, H, W) blended rigid transform of each pixel, camera frame.
             background: (N, 1, H, W) the mask of the background, which never moves.
         """
-        height, width = transform.shape[-2:]
-        rays = self.points @ self.K.T  # (N, M, 3)
-        pixels = rays[..., :2] / rays[..., 2:].clamp(min=1e-6)
-        grid = 2 * pixels / torch.tensor([width - 1, height - 1], dtype=pixels.dtype, device=pixels.device) - 1
-        fields = torch.cat((transform.flatten(1, 2), background), dim=1).to(pixels.dtype)
-        read = grid_sample(fields, grid[:, :, None], padding_mode="border", align_corners=True)  # (N, 13, M, 1)
-        mean = read.squeeze(-1).mean(dim=2)  # (N, 13)
+        mean = _seen_at(self.points, self.K, torch.cat((transform.flatten(1, 2), background), dim=1)).mean(dim=1)
         still = torch.eye(3, 4, dtype=mean.dtype, device=mean.device)
-        behind = mean[:, 12, None, None].clamp(max=1 - self.least)
+        behind = mean[:, 12, None, None].clamp(max=1 - LEAST_FOREGROUND)
         motion = (mean[:, :12].unflatten(1, (3, 4)) - behind * still) / (1 - behind)  # (N, 3, 4)
         turn, shift = motion[..., :3].mT, motion[..., 3]
         points = self.points @ turn + shift[:, None]
         tcp = (self.tcp[:, None] @ turn)[:, 0] + shift
-        return HandTrack(tcp, points, self.K, self.least)
+        return HandTrack(tcp, points, self.K)
+
+    def expected_position(self) -> Tensor:
+        """(N, 3), the TCP."""
+        return self.tcp
+
+    def expected_distance(self, goal: Tensor) -> Tensor:
+        """(N,), of the TCP to a goal (3,)."""
+        return (self.tcp - goal).norm(dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceTrack:
+    """Points of a surface in N imagined futures, and where each says that the followed one is; camera frame, metres.
+
+    Attributes:
+        points: (N, M, 3).
+        claims: (N, M, 3), the followed point, moved as each of them is. As long as they move as one body, they agree.
+        K: (3, 3) intrinsics, pixel centres at integers.
+    """
+
+    points: Tensor
+    claims: Tensor
+    K: Tensor
+
+    @classmethod
+    def start(cls, points: Tensor, point: Tensor, K: Tensor, futures: int) -> SurfaceTrack:
+        """Follow `point` (3,) by the points (M, 3) around it."""
+        shape = (futures, *points.shape)
+        return cls(points.expand(shape), point.expand(shape), K)
+
+    def advance(self, transform: Tensor, background: Tensor) -> SurfaceTrack:
+        """One predicted step on: each point and its claim go by the blended transform that is seen at the point.
+
+        A thing may stand still while the end-effector moves beside it. What little of that is blended into the thing's
+        pixels must not be taken for its motion, so that the background is not set apart here.
+
+        Args:
+            transform: (N, 3, 4, H, W) blended rigid transform of each pixel, camera frame.
+            background: not used.
+        """
+        motion = _seen_at(self.points, self.K, transform.flatten(1, 2)).unflatten(2, (3, 4))  # (N, M, 3, 4)
+        turn, shift = motion[..., :3], motion[..., 3]
+        points, claims = ((turn @ of[..., None]).squeeze(-1) + shift for of in (self.points, self.claims))
+        return SurfaceTrack(points, claims, self.K)
+
+    def expected_position(self) -> Tensor:
+        """(N, 3), the mean claim."""
+        return self.claims.mean(dim=1)
+
+    def expected_distance(self, goal: Tensor) -> Tensor:
+        """(N,), the mean distance of the claims to a goal (3,).
+
+        Where they go apart, the model does not know where the thing goes, and this is more than the distance of their
+        mean, as a pixel's expected distance is for models of pictures. A planner that is given the distance of the mean
+        finds the futures in which half of a thing flies past the goal while the other half stays.
+        """
+        return (self.claims - goal).norm(dim=-1).mean(dim=1)
+
+
+def _seen_at(points: Tensor, K: Tensor, fields: Tensor) -> Tensor:
+    """Fields (N, C, H, W), linearly between pixels, where points (N, M, 3) project to: (N, M, C)."""
+    height, width = fields.shape[-2:]
+    rays = points @ K.T
+    pixels = rays[..., :2] / rays[..., 2:].clamp(min=1e-6)
+    grid = 2 * pixels / torch.tensor([width - 1, height - 1], dtype=pixels.dtype, device=pixels.device) - 1
+    read = grid_sample(fields.to(pixels.dtype), grid[:, :, None], padding_mode="border", align_corners=True)
+    return read.squeeze(-1).mT

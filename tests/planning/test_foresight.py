@@ -19,18 +19,18 @@ def test_plans_go_everywhere_within_the_limit():
 
 
 def test_ways_are_compared_by_how_far_they_truly_go():
-    found, here, goal = Comparison(), np.zeros(3), np.array([0.1, 0.0, 0.0])
-    ends = np.array([[0.0, 0, 0], [0.03, 0, 0], [0.04, 0, 0], [0.09, 0, 0]])
-    true = np.stack([ends / 2, ends], axis=1)
-    there = np.array([0.5, 0.5, 0.0])  # it takes the point to be elsewhere
-    half = ends / 2 + [[0, 0.002, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]]
-    found.add(here, true, there, there + np.stack([half / 2, half], axis=1), goal)
+    found = Comparison()
+    true = np.array([[0.0, 0, 0], [0.03, 0, 0], [0.04, 0, 0], [0.09, 0, 0]])
+    foreseen = true / 2 + [[0, 0.002, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]]
+    found.add(true, foreseen, (np.array([0.4, 0.3, 0.2, 0.1]), np.array([0.3, 0.4, 0.2, 0.1])))
+    found.add(true, foreseen, (np.array([0.4, 0.3, 0.2, 0.1]), np.full(4, 0.3)))  # their order says nothing
     table = found.table()
-    assert [row["plans"] for row in table["ways"]] == [1, 2, 1]  # none goes 1 to 20 mm
+    assert [row["plans"] for row in table["ways"]] == [2, 4, 2]  # none goes 1 to 20 mm
     still, middle, far = table["ways"]
     assert still["foreseen_m"] == pytest.approx(0.002) and still["error_m"] == pytest.approx(0.002)
     assert middle["true_m"] == pytest.approx(0.035) and middle["error_m"] == pytest.approx(0.0175)
     assert far["cosine"] == pytest.approx(1) and far["to_m"] is None
+    assert table["decisions"] == 1 and table["rank_correlation"] == pytest.approx(0.8)
 
 
 def test_the_command_compares_and_writes(tmp_path, capsys):

@@ -8,7 +8,7 @@ from worldmodel.kernels import KernelHeads, KernelPrediction
 from worldmodel.models import KINDS
 from worldmodel.pixel_tracking import PixelTrack, uniform_pixels
 
-SIZE = 32
+SIZE = 48
 
 
 def one_hot(u, v):
@@ -50,6 +50,7 @@ def test_pixels_go_where_the_model_puts_their_colour(kind, make_model, camera_of
         picture = expected[:, None].expand(3, 3, SIZE, SIZE)
     top, bottom, left, right = track.box
     assert bottom - top < SIZE and right - left < SIZE  # part of the picture was enough
+    assert all(edge % 8 == 0 for edge in track.box)  # of a few sizes, so that memory is used again
 
 
 def test_futures_begin_as_one_and_move_apart():

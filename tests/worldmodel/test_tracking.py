@@ -1,11 +1,11 @@
-"""The hand is found, and followed exactly where the transforms are exact."""
+"""Hand and surfaces are followed exactly where the transforms are exact; where these disagree, it counts."""
 
 import numpy as np
 import pytest
 import torch
 
 from envs.camera import CameraModel
-from worldmodel.tracking import HandTrack, hand_pixels
+from worldmodel.tracking import HandTrack, SurfaceTrack, hand_pixels
 
 BACKGROUND, HAND = 4.6, 4.2  # metres
 
@@ -111,3 +111,57 @@ def test_futures_are_apart_and_points_off_the_picture_do_no_harm(camera):
     track = track.advance(field, nothing_behind).advance(field, nothing_behind)
     np.testing.assert_allclose(track.tcp[0], tcp)
     np.testing.assert_allclose(track.tcp[1], tcp + 2 * far[1, :, 3])
+
+
+def on_the_hand(camera, pixels):
+    """Points (M, 3) of the square at these (u, v)."""
+    points, _ = scene(camera)
+    return torch.stack([points[:, v, u] for u, v in pixels])
+
+
+def test_a_turning_surface_takes_its_point_along_and_its_points_agree(camera):
+    body = on_the_hand(camera, [(20, 24), (25, 24), (21, 29)])
+    point = body[0] + torch.tensor([0.004, -0.003, 0.0])
+    angle = torch.tensor(0.4, dtype=torch.float64)
+    cos, sin = torch.cos(angle), torch.sin(angle)
+    turn = torch.eye(3, dtype=torch.float64)
+    turn[0, :2], turn[1, :2] = torch.stack([cos, -sin]), torch.stack([sin, cos])
+    pivot, shift = body.mean(dim=0), torch.tensor([0.01, 0.02, 0.0], dtype=torch.float64)
+    transform = torch.cat([turn, (pivot - turn @ pivot + shift)[:, None]], dim=1)
+    everywhere = transform[None, :, :, None, None].expand(2, 3, 4, 64, 64)
+    track = SurfaceTrack.start(body, point, intrinsics(camera), futures=2)
+    expected = point
+    for _ in range(3):
+        track = track.advance(everywhere, torch.zeros(2, 1, 64, 64))
+        expected = turn @ (expected - pivot) + pivot + shift
+    np.testing.assert_allclose(track.expected_position(), expected.expand(2, 3), atol=1e-9)
+    goal = expected + torch.tensor([0.0, 0.03, 0.04])
+    np.testing.assert_allclose(track.expected_distance(goal), [0.05, 0.05], atol=1e-9)
+
+
+def test_a_surface_that_is_torn_apart_is_not_at_its_goal_though_its_mean_is(camera):
+    """Half of the points fly twice as far as the goal, the others stay; each is read where it has gone."""
+    body = on_the_hand(camera, [(20, 24), (20, 29), (25, 24), (25, 29)])
+    point = body.mean(dim=0)
+    step = torch.tensor([6 * HAND / camera.K[0, 0], 0.0, 0.0], dtype=torch.float64)  # 6 pixels
+    track = SurfaceTrack.start(body, point, intrinsics(camera), futures=1)
+    for gone in (0, 6):
+        field = torch.eye(3, 4, dtype=torch.float64)[None, :, :, None, None].repeat(1, 1, 1, 64, 64)
+        field[:, :, 3, :, 24 + gone : 27 + gone] += step.view(1, 3, 1, 1)
+        track = track.advance(field, torch.zeros(1, 1, 64, 64))
+    goal = point + step
+    np.testing.assert_allclose(track.expected_position()[0], goal, atol=1e-9)
+    np.testing.assert_allclose(track.expected_distance(goal), step.norm()[None], atol=1e-9)
+
+
+def test_what_little_is_blended_into_a_thing_at_rest_hardly_moves_it(camera):
+    """Not so for the hand, which is known to move."""
+    body = on_the_hand(camera, [(20, 24), (25, 29)])
+    point, shift = body.mean(dim=0), torch.tensor([0.05, 0.0, 0.0], dtype=torch.float64)
+    background = torch.full((1, 1, 64, 64), 0.97, dtype=torch.float64)
+    field = torch.eye(3, 4, dtype=torch.float64)[None, :, :, None, None].repeat(1, 1, 1, 64, 64)
+    field[:, :, 3] += (1 - background) * shift.view(1, 3, 1, 1)
+    surface = SurfaceTrack.start(body, point, intrinsics(camera), futures=1).advance(field, background)
+    hand = HandTrack(point[None], body[None], intrinsics(camera)).advance(field, background)
+    np.testing.assert_allclose(surface.expected_distance(point), [0.03 * 0.05], atol=1e-9)
+    np.testing.assert_allclose(hand.expected_distance(point), [0.05], atol=1e-9)
