@@ -167,6 +167,16 @@ def test_what_is_not_touched_is_reached_for(far, make_exact_model):
     assert left[1] < 0.02 < left[0]
 
 
+def test_reaching_is_for_the_far_side():
+    reach, goal = Reach(0.5, beyond=0.1, near=0.02), np.zeros(2)
+    points = np.array([[0.08, 0.0], [0.08, 0.0], [0.02, 0.0], [0.0, 0.0]])
+    effectors = np.array([[0.16, 0.0], [0.0, 0.0], [0.07, 0.04], [0.3, 0.4]])
+    costs = [0.0, 0.5 * 0.16, 0.5 * 0.04, 0.5 * 0.5]
+    np.testing.assert_allclose(reach.cost(effectors, points, goal), costs, atol=1e-12)
+    pixels = reach.cost(torch.as_tensor(50 * effectors), torch.as_tensor(50 * points), torch.zeros(2), per_metre=50)
+    np.testing.assert_allclose(pixels, 50 * np.array(costs), atol=1e-12)
+
+
 def test_without_a_model_a_thing_moves_only_if_it_is_glued(block, far):
     assert servo(ProportionalController(**parts(block)), block, far)[-1] < 0.003
     assert servo(LinearController(planner=planner(), hold=3, **parts(block)), SlidingWorld(), far, 36)[-1] < 0.02
