@@ -163,8 +163,8 @@ class SurfaceTrack:
         """(N,), the mean distance of the claims to a goal (3,).
 
         Where they go apart, the model does not know where the thing goes, and this is more than the distance of their
-        mean, as a pixel's expected distance is for models of pictures. A planner that is given the distance of the mean
-        finds the futures in which half of a thing flies past the goal while the other half stays.
+        mean, as a pixel's expected distance is for models of pictures. The distance of the mean would be small in a
+        future in which half of a thing flies past the goal while the other half stays.
         """
         return (self.claims - goal).norm(dim=-1).mean(dim=1)
 
