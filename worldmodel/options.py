@@ -85,10 +85,10 @@ class TrainOptions:
     """The curriculum."""
     frame_gap: int = 3
     """Control steps from one frame of a clip to the next; the actions between are added up."""
-    action_column: Literal["action", "action_change", "joint_delta"] = "action"
+    action_column: Literal["action", "action_change", "action_followed", "joint_delta"] = "action"
     """What the model is conditioned on: commanded actions; where these are absolute (DexHand), by how much each differs
-    from the one before it; or, where the data has it, how far each joint went, as in the paper. That tells of the
-    outcome, and no planner knows it."""
+    from the one before it, or how far joints go that follow them with a lag; or, where the data has it, how far each
+    joint went, as in the paper. That tells of the outcome, and no planner knows it."""
     context: int = 2
     """Frames that the model sees before it predicts."""
     steps: int = 200_000

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from data_collection.actions import aggregate_actions
 from data_collection.dataset import RGBDDataset
 from envs.errors import UsageError
-from worldmodel.clips import Clips, ClipSource
+from worldmodel.clips import FOLLOWING_SECONDS, Clips, ClipSource
 from worldmodel.colour_jitter import ColourJitter
 from worldmodel.geometry import pixel_rays, project
 from worldmodel.splatting import splat
@@ -166,6 +166,24 @@ def test_changes_of_absolute_commands(tmp_path, write_dataset):
     np.testing.assert_allclose(told[0, 0], commands[14] - commands[12], atol=1e-6)  # an episode begins: from its first
     np.testing.assert_allclose(told[0, 1], commands[17] - commands[14], atol=1e-6)
     np.testing.assert_allclose(told[1, 0], commands[15] - commands[12], atol=1e-6)
+
+
+def test_what_follows_absolute_commands_with_a_lag(tmp_path, write_dataset):
+    relative = RGBDDataset(write_dataset(tmp_path / "relative", [12, 12]))
+    with pytest.raises(UsageError, match="not all absolute"):
+        ClipSource(relative, GAP, action_column="action_followed")
+    dataset = RGBDDataset(write_dataset(tmp_path / "absolute", [12, 12], action_aggregation=["last"] * 7))
+    commands = dataset.load("action").astype(np.float64)
+    share = 1 - np.exp(-1 / (dataset.attrs["control_rate"] * FOLLOWING_SECONDS))
+    places = np.empty((25, 7))
+    for episode in (0, 12):
+        place = commands[episode]
+        for step in range(episode, episode + 12):
+            places[step] = place
+            place = place + share * (commands[step] - place)
+    told = ClipSource(dataset, GAP, action_column="action_followed").at(np.array([0, 12, 14]), 4).actions.numpy()
+    for clip, start in enumerate((0, 12, 14)):
+        np.testing.assert_allclose(told[clip], np.diff(places[start : start + 10 : GAP], axis=0), atol=1e-6)
 
 
 def test_colour_jitter_changes_colours_only_and_whole_clips_alike(source, starts):
