@@ -47,15 +47,16 @@ class Reach:
     """Draws the end-effector to where it can push the point towards its goal: beyond the point, as seen from there.
 
     What is not touched does not move, whatever is done elsewhere: without this, all plans that do not come to touch the
-    thing in time would cost the same.
+    thing in time would cost the same. At the goal there is nothing left to push, so it fades: the place is then the point
+    itself, on the thing, where the end-effector cannot be and would push the thing on.
     """
 
     weight: float
-    """of that distance beside the point's to its goal"""
+    """of that distance beside the point's to its goal, far from there"""
     beyond: float
-    """metres behind the point"""
+    """metres behind the point, far from the goal"""
     near: float = 0.02
-    """metres from the goal at which it is but half as far behind; at the goal it is the point itself"""
+    """metres from the goal at which both are but half as much; at the goal they are 0"""
 
     def cost(
         self, effector: ArrayOrTensor, point: ArrayOrTensor, goal: ArrayOrTensor, per_metre: float = 1.0
@@ -66,6 +67,6 @@ class Reach:
             per_metre: what a metre is in the unit of the places: 1, or pixels for places in the picture.
         """
         way = point - goal
-        length = ((way**2).sum(-1) ** 0.5)[..., None]
-        place = point + self.beyond * per_metre * way / (length + self.near * per_metre)
-        return self.weight * ((effector - place) ** 2).sum(-1) ** 0.5
+        length, near = (way**2).sum(-1) ** 0.5, self.near * per_metre
+        place = point + self.beyond * per_metre * way / (length + near)[..., None]
+        return self.weight * length / (length + near) * ((effector - place) ** 2).sum(-1) ** 0.5

@@ -28,8 +28,9 @@ class Schedule:
     """Scheduled sampling: the share of true inputs falls from 1 at the start to 0 here (half at half of this)."""
     posterior_from: float = 0.25
     """Before this, latents are drawn from the prior; from here on from the inference network."""
-    kl_ramp: tuple[float, float] = (0.5, 0.6)
-    """The KL weight rises from 0 to its value between these."""
+    kl_ramp: tuple[float, float] = (0.25, 0.3)
+    """The KL weight rises from 0 to its value between these. Latents that are free for long tell all that happens, and
+    without them the model predicts that little does."""
     clip_lengths: tuple[tuple[float, int], ...] = ((0.3, 4), (0.6, 8), (1.0, 12))
     """Until which fraction of the run clips have how many frames: short clips first, where a step is cheap."""
 

@@ -16,6 +16,7 @@ from tests.benchmarks.plain import PLAIN, plain_operators
 from tests.benchmarks.timing import median_seconds
 from worldmodel.clips import ClipSource
 from worldmodel.config import ModelContext
+from worldmodel.memory import keep_freed_memory
 from worldmodel.models import make_model, named_config
 from worldmodel.options import PRESETS, TrainOptions
 from worldmodel.trainer import Trainer
@@ -62,6 +63,7 @@ def make_trainer(kind: str, preset: str, **changes: Any) -> Trainer:
         options = replace(options, precision="float32")
         model = PLAIN[name](architecture, context)
     else:
+        keep_freed_memory()
         model = make_model(name, architecture, context).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     source = ClipSource(MadeUpDataset(), options.frame_gap)  # type: ignore[arg-type]
     trainer = Trainer(model, options, source, None, {})  # type: ignore[arg-type]  # nothing is validated
