@@ -47,8 +47,8 @@ class Reach:
     """Draws the end-effector to where it can push the point towards its goal: beyond the point, as seen from there.
 
     What is not touched does not move, whatever is done elsewhere: without this, all plans that do not come to touch the
-    thing in time would cost the same. At the goal there is nothing left to push, so it fades: the place is then the point
-    itself, on the thing, where the end-effector cannot be and would push the thing on.
+    thing in time would cost the same. At the goal there is nothing left to push, so it fades: the place is then the
+    point itself, on the thing, where the end-effector cannot be and would push the thing on.
     """
 
     weight: float
