@@ -23,7 +23,7 @@ import os
 import re
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +130,9 @@ def load_model(name: str | Path, device: str | torch.device = "cpu", precision: 
     try:
         document = json.loads((folder / CONFIG).read_text())
         config, context = dict(document["model"]), dict(document["context"])
+        unsaid = {field.name for field in fields(ModelConfig)} - set(config)
+        if unsaid:  # defaults change, and weights mean something only with what they were trained with
+            raise ValueError(f"its {CONFIG} does not say {', '.join(sorted(unsaid))}")
         hashable: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in context.items()}
         model = make_model(document["kind"], ModelConfig(**config), ModelContext(**hashable))
         model.load_state_dict(load_file(folder / WEIGHTS))

@@ -40,6 +40,9 @@ class ModelConfig:
     """How points that land on the same pixel share it: `over` lays the nearer over the farther."""
     splat_sharpness: float = 3.0
     """Of splat `softmax`, in 1/metre."""
+    translation_unit: float = 10.0
+    """T3VIP's translations are learned in units of so many pixels (at mid depth). In large units they learn faster than
+    masks: the background then keeps most of every pixel and what is left of it goes far, the hand as one piece."""
     first_shift: float = 0.0
     """T3VIP's transforms start out with shifts of about so many pixels, each its own, that depend on the action; 0
     starts with the identity, as the paper. Where a hundredth of the picture moves, 1 finds the motion far sooner."""
@@ -55,6 +58,8 @@ class ModelConfig:
             raise UsageError(f"kernel-size is {self.kernel_size}; give an odd number such as 5 or 9")
         if self.masks < 2:
             raise UsageError(f"masks is {self.masks}; give at least 2 (a background and one that moves)")
+        if not self.translation_unit > 0:
+            raise UsageError(f"translation-unit is {self.translation_unit}; give a positive number of pixels")
         if self.first_shift < 0:
             raise UsageError(f"first-shift is {self.first_shift}; give pixels, 0 or more")
         if self.splat_sharpness < 0:

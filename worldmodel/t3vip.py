@@ -60,13 +60,15 @@ class TransformHead(nn.Module):
         action_dim: numbers in an action; without any, each transform starts with a shift that is always the same.
         count: of transforms.
         width: multiplier on the channels.
-        shift: standard deviation of the first shifts along each axis, under actions as they usually are, metres.
+        unit: what a translation of 1 is in the last layer, metres.
+        shift: standard deviation of the first shifts along each axis, under actions as they usually are, in this unit.
     """
 
     identity: Tensor
 
-    def __init__(self, inputs: int, action_dim: int, count: int, width: float, shift: float) -> None:
+    def __init__(self, inputs: int, action_dim: int, count: int, width: float, unit: float, shift: float) -> None:
         super().__init__()
+        self.unit = unit
         wide, narrow = scaled(256, width), scaled(128, width)
         self.first = nn.Linear(inputs, wide)
         self.second = nn.Linear(wide + action_dim, narrow)
@@ -86,7 +88,7 @@ class TransformHead(nn.Module):
         # The last layer is tiny and decides on millimetres: always in float32.
         with torch.autocast(x.device.type, enabled=False):
             x = self.last(torch.cat((x.float(), action.float()), dim=1)).unflatten(1, (-1, 9))
-            return geometry.rotation_from_6d(x[..., 3:] + self.identity), x[..., :3]
+            return geometry.rotation_from_6d(x[..., 3:] + self.identity), self.unit * x[..., :3]
 
 
 class Heads(NamedTuple):
@@ -119,8 +121,10 @@ class T3VIP(WorldModel):
         self.mask_decoder = Decoder(config.masks, config)
         self.inpainter = Decoder(4, config)
         pixel = (self.camera.near + self.camera.far) / 2 / float(self.camera.K[0, 0])  # metres, half way to the back
-        shift = config.first_shift * pixel
-        self.transforms = TransformHead(self.embedding_size, self.action_dim, config.masks - 1, config.width, shift)
+        unit, shift = config.translation_unit * pixel, config.first_shift / config.translation_unit
+        self.transforms = TransformHead(
+            self.embedding_size, self.action_dim, config.masks - 1, config.width, unit, shift
+        )
         nn.init.normal_(self.mask_decoder.head.weight, std=config.mask_head_std)
 
         intrinsics = torch.from_numpy(np.array(self.camera.K)).float()

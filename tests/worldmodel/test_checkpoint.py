@@ -107,6 +107,7 @@ DAMAGE = {
     "config is binary": lambda folder: (folder / CONFIG).write_bytes(b"\xff\xfe\x00\x81"),
     "config of something else": lambda folder: (folder / CONFIG).write_text("{}"),
     "an option unknown here": lambda folder: edit(folder / CONFIG, "model", colour="red"),
+    "an option that it does not say": lambda folder: edit(folder / CONFIG, "model", translation_unit=None),
     "weights of another width": lambda folder: edit(folder / CONFIG, "model", width=0.5),
     "no weights": lambda folder: (folder / WEIGHTS).unlink(),
     "no config": lambda folder: (folder / CONFIG).unlink(),
@@ -116,6 +117,7 @@ DAMAGE = {
 def edit(path, section, **changed):
     document = json.loads(path.read_text())
     document[section].update(changed)
+    document[section] = {name: value for name, value in document[section].items() if value is not None}
     path.write_text(json.dumps(document))
 
 

@@ -52,6 +52,17 @@ def test_first_shifts_follow_the_action_each_its_own_way(make_model, clips):
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("unit", [5.0, 20.0])
+def test_translations_are_learned_in_pixels(make_model, unit):
+    model = make_model(moving=False, translation_unit=unit)
+    torch.nn.init.zeros_(model.transforms.last.weight)
+    torch.nn.init.ones_(model.transforms.last.bias)
+    _, translation = model.transforms(torch.zeros(1, model.embedding_size), torch.zeros(1, model.action_dim))
+    pixel = (model.camera.near + model.camera.far) / 2 / model.camera.K[0, 0]
+    torch.testing.assert_close(translation, torch.full_like(translation, unit * pixel))
+
+
+@torch.no_grad()
 def test_without_transforms_any_model_copies(model, clips):
     rollout = unroll(model, clips, context=2, still=True)
     for t, prediction in enumerate(rollout.predictions):
