@@ -33,7 +33,7 @@ class LossWeights:
     """lambda_4, second differences of scene flow, metres."""
     optical_smoothness: float = 5e-4
     """lambda_5, second differences of optical flow, pixels."""
-    kl: float = 1e-2
+    kl: float = 0.1
     """lambda_6, divergence of the latents from the prior, nats a pixel. With the reference's 1e-3 latents told the
     model how everything moves, and it did not learn that from the actions."""
     power: Literal[1, 2] = 1
