@@ -92,6 +92,11 @@ def action_units(dataset: RGBDDataset, action_column: str) -> tuple[tuple[str, .
     return ("sum",) * len(scale), scale
 
 
+def usual_column(dataset: RGBDDataset) -> str:
+    """The action column that a model learns best from without being told the outcome."""
+    return "action_followed" if set(dataset.attrs["action_aggregation"]) == {"last"} else "action"
+
+
 def action_changes(actions: NDArray[Any], slices: NDArray[np.int64]) -> NDArray[Any]:
     """(N, A) what each action of some episodes changes in the one before; 0 in an episode's first.
 

@@ -86,10 +86,11 @@ class TrainOptions:
     """The curriculum."""
     frame_gap: int = 3
     """Control steps from one frame of a clip to the next; the actions between are added up."""
-    action_column: Literal["action", "action_change", "action_followed", "joint_delta"] = "action"
+    action_column: Literal["auto", "action", "action_change", "action_followed", "joint_delta"] = "auto"
     """What the model is conditioned on: commanded actions; where these are absolute (DexHand), by how much each differs
     from the one before it, or how far joints go that follow them with a lag; or, where the data has it, how far each
-    joint went, as in the paper. That tells of the outcome, and no planner knows it."""
+    joint went, as in the paper. That tells of the outcome, and no planner knows it. `auto` is action_followed where all
+    commands are absolute, else action; what it came to is written down."""
     context: int = 2
     """Frames that the model sees before it predicts."""
     steps: int = 200_000

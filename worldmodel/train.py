@@ -42,6 +42,7 @@ def train_with(ranks: Ranks, options: TrainOptions) -> None:
     """Train as one of several processes, which all call this."""
     ranks.share(options.batch)  # refuse an odd one before the data is read
     train, validation = open_data(options)
+    options = replace(options, action_column=train.action_column)  # type: ignore[arg-type]  # that `auto` came to
 
     def prepare(options: TrainOptions) -> Trainer:
         return make_trainer(options, train, validation, ranks)
@@ -112,6 +113,8 @@ def existing_run(options: TrainOptions) -> TrainOptions | None:
             options = replace(options, steps=int(before["steps"]))
         if options.precision == "auto":
             options = replace(options, precision=before["precision"])
+        if options.action_column == "auto":
+            options = replace(options, action_column=before["action_column"])
     except (ValueError, TypeError, KeyError) as error:
         raise UsageError(f"{path} is damaged ({error}); restore it, or give another --out") from error
     document = document_of(options)

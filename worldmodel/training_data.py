@@ -5,7 +5,7 @@ from __future__ import annotations
 from data_collection.dataset import RGBDDataset
 from envs.errors import UsageError
 from envs.planar_push.objects import SPLITS, canonical
-from worldmodel.clips import HELD, ClipSource
+from worldmodel.clips import HELD, ClipSource, usual_column
 from worldmodel.config import ModelContext
 from worldmodel.interface import Interface, mismatch
 from worldmodel.memory import available_memory
@@ -40,24 +40,21 @@ def open_data(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
                 f"{opened.path} holds objects for testing only; collect with --scene train and --scene validation"
             )
     limit = _memory_limit(options)
+    column = usual_column(dataset) if options.action_column == "auto" else options.action_column
     if options.validation is not None:
         held_out = RGBDDataset(options.validation)
-        _same_world(dataset, held_out, options.action_column)
-        train = ClipSource(dataset, options.frame_gap, action_column=options.action_column, memory_limit=limit)
+        _same_world(dataset, held_out, column)
+        train = ClipSource(dataset, options.frame_gap, action_column=column, memory_limit=limit)
         limit -= dataset.size_of(HELD) if train.in_memory else 0
-        other = ClipSource(held_out, options.frame_gap, action_column=options.action_column, memory_limit=limit)
+        other = ClipSource(held_out, options.frame_gap, action_column=column, memory_limit=limit)
     else:
         if dataset.episodes < 2:
             raise UsageError(
                 f"{dataset.path} has {dataset.episodes} episode, none to hold out; collect more, or give --validation"
             )
         split = dataset.episodes - max(1, dataset.episodes // HELD_OUT)
-        train = ClipSource(
-            dataset, options.frame_gap, slice(0, split), action_column=options.action_column, memory_limit=limit
-        )
-        other = ClipSource(
-            dataset, options.frame_gap, slice(split, None), share=train, action_column=options.action_column
-        )
+        train = ClipSource(dataset, options.frame_gap, slice(0, split), action_column=column, memory_limit=limit)
+        other = ClipSource(dataset, options.frame_gap, slice(split, None), share=train, action_column=column)
     frames = max(frames for _, frames in options.schedule.clip_lengths)
     for clips in (train, other):
         clips.starts(frames)  # now, not hours later, when the curriculum gets there

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from data_collection.actions import aggregate_actions
 from data_collection.dataset import RGBDDataset
 from envs.errors import UsageError
-from worldmodel.clips import FOLLOWING_SECONDS, Clips, ClipSource
+from worldmodel.clips import FOLLOWING_SECONDS, Clips, ClipSource, usual_column
 from worldmodel.colour_jitter import ColourJitter
 from worldmodel.geometry import pixel_rays, project
 from worldmodel.splatting import splat
@@ -172,7 +172,9 @@ def test_what_follows_absolute_commands_with_a_lag(tmp_path, write_dataset):
     relative = RGBDDataset(write_dataset(tmp_path / "relative", [12, 12]))
     with pytest.raises(UsageError, match="not all absolute"):
         ClipSource(relative, GAP, action_column="action_followed")
+    assert usual_column(relative) == "action"
     dataset = RGBDDataset(write_dataset(tmp_path / "absolute", [12, 12], action_aggregation=["last"] * 7))
+    assert usual_column(dataset) == "action_followed"
     commands = dataset.load("action").astype(np.float64)
     share = 1 - np.exp(-1 / (dataset.attrs["control_rate"] * FOLLOWING_SECONDS))
     places = np.empty((25, 7))
