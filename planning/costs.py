@@ -55,7 +55,7 @@ class Reach:
     """of that distance beside the point's to its goal, far from there"""
     beyond: float
     """metres behind the point, far from the goal"""
-    near: float = 0.02
+    fade: float = 0.02
     """metres from the goal at which both are but half as much; at the goal they are 0"""
 
     def cost(
@@ -67,6 +67,6 @@ class Reach:
             per_metre: what a metre is in the unit of the places: 1, or pixels for places in the picture.
         """
         way = point - goal
-        length, near = (way**2).sum(-1) ** 0.5, self.near * per_metre
-        place = point + self.beyond * per_metre * way / (length + near)[..., None]
-        return self.weight * length / (length + near) * ((effector - place) ** 2).sum(-1) ** 0.5
+        length, fade = (way**2).sum(-1) ** 0.5, self.fade * per_metre
+        place = point + self.beyond * per_metre * way / (length + fade)[..., None]
+        return self.weight * length / (length + fade) * ((effector - place) ** 2).sum(-1) ** 0.5

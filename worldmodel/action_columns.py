@@ -33,9 +33,16 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Measure and print a line for each column."""
+    """Measure and print a line for each column.
+
+    Raises:
+        UsageError: the commands are not absolute.
+    """
+    dataset = RGBDDataset(config.data)
+    if set(dataset.attrs["action_aggregation"]) != {"last"}:
+        raise UsageError(f"the commands in {dataset.path} are not all absolute: there is only one way of telling them")
     told = [column for column in ACTION_COLUMNS if column != OUTCOME]
-    shares = [explained(RGBDDataset(config.data), gap, told) for gap in config.gap]
+    shares = [explained(dataset, gap, told) for gap in config.gap]
     print("column", *(f"gap-{gap}" for gap in config.gap))
     for column in told:
         print(column, *(f"{share[column]:.2f}" for share in shares))

@@ -93,8 +93,9 @@ def action_units(dataset: RGBDDataset, action_column: str) -> tuple[tuple[str, .
 
 
 def usual_column(dataset: RGBDDataset) -> str:
-    """The action column that a model learns best from without being told the outcome."""
-    return "action_followed" if set(dataset.attrs["action_aggregation"]) == {"last"} else "action"
+    """What was commanded, or, where joints follow absolute commands, what follows them; never what came of it."""
+    servoed = set(dataset.attrs["action_aggregation"]) == {"last"} and "joint_delta" in dataset.columns
+    return "action_followed" if servoed else "action"
 
 
 def action_changes(actions: NDArray[Any], slices: NDArray[np.int64]) -> NDArray[Any]:
@@ -116,7 +117,8 @@ def actions_followed(actions: NDArray[Any], slices: NDArray[np.int64], control_r
     is at the first command.
 
     Args:
-        actions, slices: see `action_changes`.
+        actions: (N, A), absolute.
+        slices: (E, 2) first row of each episode, and the one after its last; all N rows, in their order.
         control_rate: control steps a second.
     """
     share = 1 - np.exp(-1 / (control_rate * FOLLOWING_SECONDS))

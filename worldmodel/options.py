@@ -29,8 +29,8 @@ class Schedule:
     posterior_from: float = 0.25
     """Before this, latents are drawn from the prior; from here on from the inference network."""
     kl_ramp: tuple[float, float] = (0.25, 0.3)
-    """The KL weight rises from 0 to its value between these. Latents that are free for long tell all that happens, and
-    without them the model predicts that little does."""
+    """The KL weight rises from 0 to its value between these. Where latents are free for long (from
+    `posterior_from` on) they tell all that happens, and without them the model predicts that little does."""
     clip_lengths: tuple[tuple[float, int], ...] = ((0.3, 4), (0.6, 8), (1.0, 12))
     """Until which fraction of the run clips have how many frames: short clips first, where a step is cheap."""
 
@@ -90,7 +90,7 @@ class TrainOptions:
     """What the model is conditioned on: commanded actions; where these are absolute (DexHand), by how much each differs
     from the one before it, or how far joints go that follow them with a lag; or, where the data has it, how far each
     joint went, as in the paper. That tells of the outcome, and no planner knows it. `auto` is action_followed where all
-    commands are absolute, else action; what it came to is written down."""
+    commands are absolute and the data tells of joints, else action; what it came to is written down."""
     context: int = 2
     """Frames that the model sees before it predicts."""
     steps: int = 200_000

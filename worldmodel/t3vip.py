@@ -6,6 +6,7 @@ Where this departs from the paper or from its public code, and why:
   origin throws points so far that rotation and translation fight each other.
 - The action enters the head of the transforms as well as the trunk, so that "the hand goes where it is told" is a
   linear map that is learned in minutes.
+- Translations are learned in units of some pixels, lest a step of Adam move things by many of them.
 - Points that leave the picture or lie behind the camera are dropped, not clamped to the border.
 """
 

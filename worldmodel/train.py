@@ -23,7 +23,7 @@ from worldmodel.models import make_model, named_config
 from worldmodel.options import PRESETS, TrainOptions
 from worldmodel.ranks import Ranks, join_ranks
 from worldmodel.trainer import Trainer
-from worldmodel.training_data import model_context, open_data
+from worldmodel.training_data import model_context, open_data, settled
 from worldmodel.validation import ValidationSet
 
 HOW_NOT_WHAT = ("device", "deterministic", "memory_limit", "save_every", "log_every")
@@ -41,8 +41,8 @@ def main(options: TrainOptions) -> None:
 def train_with(ranks: Ranks, options: TrainOptions) -> None:
     """Train as one of several processes, which all call this."""
     ranks.share(options.batch)  # refuse an odd one before the data is read
+    options = settled(options)
     train, validation = open_data(options)
-    options = replace(options, action_column=train.action_column)  # type: ignore[arg-type]  # that `auto` came to
 
     def prepare(options: TrainOptions) -> Trainer:
         return make_trainer(options, train, validation, ranks)
@@ -113,18 +113,24 @@ def existing_run(options: TrainOptions) -> TrainOptions | None:
             options = replace(options, steps=int(before["steps"]))
         if options.precision == "auto":
             options = replace(options, precision=before["precision"])
-        if options.action_column == "auto":
-            options = replace(options, action_column=before["action_column"])
     except (ValueError, TypeError, KeyError) as error:
         raise UsageError(f"{path} is damaged ({error}); restore it, or give another --out") from error
     document = document_of(options)
     for name in document:
         if name not in HOW_NOT_WHAT and not _same(name, before.get(name), document[name]):
             raise UsageError(
-                f"{options.out} holds a run with {name} = {before.get(name)}, not {document[name]}; give the same "
+                f"{options.out} holds a run with {_difference(name, before.get(name), document[name])}; give the same "
                 "options to go on with it, or another --out"
             )
     return options
+
+
+def _difference(name: str, before: Any, now: Any) -> str:
+    """An option's two values; of a group of options, those of the first that differs."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        key = next(key for key in {**now, **before} if before.get(key) != now.get(key))
+        return _difference(f"{name}.{key}", before.get(key), now.get(key))
+    return f"{name} = {before}, not {now}"
 
 
 def _same(name: str, before: Any, now: Any) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from data_collection.dataset import RGBDDataset
 from envs.errors import UsageError
 from envs.planar_push.objects import SPLITS, canonical
@@ -23,6 +25,14 @@ FREE_SHARE = 0.5
 """Of the memory that is free, what datasets may take; training takes some, too."""
 
 
+def settled(options: TrainOptions) -> TrainOptions:
+    """The options with the action column that `auto` comes to for their data."""
+    if options.action_column != "auto":
+        return options
+    column = usual_column(RGBDDataset(options.data))
+    return replace(options, action_column=column)  # type: ignore[arg-type]
+
+
 def open_data(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
     """Clips to train on, and those to validate on.
 
@@ -40,7 +50,7 @@ def open_data(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
                 f"{opened.path} holds objects for testing only; collect with --scene train and --scene validation"
             )
     limit = _memory_limit(options)
-    column = usual_column(dataset) if options.action_column == "auto" else options.action_column
+    column = settled(options).action_column
     if options.validation is not None:
         held_out = RGBDDataset(options.validation)
         _same_world(dataset, held_out, column)

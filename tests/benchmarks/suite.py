@@ -85,7 +85,7 @@ def train_step(quick: bool) -> Result:
     """An update of the `cpu` preset: 16 clips of 12 frames, all losses."""
     repeats = 1 if quick else 3  # it is long
     plain = measure("training.step_seconds", kind="plain", preset=_preset(quick), repeats=repeats)
-    what = "the same network in fp32, default layout, eager, sum over transformed clouds, unfold"
+    what = "the same network in fp32, default layout and memory, eager, sum over transformed clouds, unfold"
     return cost("train_step", _our_training(quick)["update"], "s", plain["update"], what)
 
 
@@ -95,7 +95,7 @@ def cdna_step(quick: bool) -> Result:
     ours, plain = (
         measure("training.cdna_step_seconds", kind=kind, preset=_preset(quick), **size) for kind in ("ours", "plain")
     )
-    return cost("cdna_step", ours, "s", plain, "the same network in fp32, default layout, eager")
+    return cost("cdna_step", ours, "s", plain, "the same network in fp32, default layout and memory, eager")
 
 
 def data_wait(quick: bool) -> Result:

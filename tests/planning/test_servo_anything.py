@@ -168,7 +168,7 @@ def test_what_is_not_touched_is_reached_for(far, make_exact_model):
 
 
 def test_reaching_is_for_the_far_side():
-    reach, goal = Reach(0.5, beyond=0.1, near=0.02), np.zeros(2)
+    reach, goal = Reach(0.5, beyond=0.1, fade=0.02), np.zeros(2)
     points = np.array([[0.08, 0.0], [0.08, 0.0], [0.02, 0.0], [0.0, 0.0]])
     effectors = np.array([[0.16, 0.0], [0.0, 0.0], [0.07, 0.04], [0.3, 0.4]])
     costs = [0.0, 0.5 * 0.8 * 0.16, 0.5 * 0.5 * 0.04, 0.0]  # half as much 2 cm from the goal, nothing at it

@@ -6,6 +6,7 @@ import pytest
 
 from data_collection.dataset import RGBDDataset
 from envs.errors import UsageError
+from worldmodel import train
 from worldmodel.action_columns import Config, explained, main
 from worldmodel.clips import actions_followed
 
@@ -42,6 +43,21 @@ def test_a_line_a_column(servoed, capsys):
     main(Config(servoed, gap=(2,)))
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["column", *COLUMNS] and lines[-1].endswith(" 1.00")
+
+
+def test_a_model_is_told_what_the_joints_follow_unless_asked_otherwise(servoed, tmp_path):
+    told = ["--preset", "tiny", "--data", str(servoed), "--out", str(tmp_path / "run"), "--steps", "2"]
+    for _ in range(2):  # the second goes on, and has nothing left to do
+        train.main(train.parse_options(told))
+    for config in ("config.json", "model/config.json"):
+        assert '"action_column": "action_followed"' in (tmp_path / "run" / config).read_text()
+    with pytest.raises(UsageError, match="action_column = action_followed, not action;"):
+        train.main(train.parse_options([*told, "--action-column", "action"]))
+
+
+def test_commands_that_are_changes_are_refused(tmp_path, write_dataset):
+    with pytest.raises(UsageError, match="not all absolute: there is only one way"):
+        main(Config(write_dataset(tmp_path, [12, 12])))
 
 
 def test_one_episode_is_too_few(tmp_path, write_dataset):

@@ -174,7 +174,7 @@ def test_what_follows_absolute_commands_with_a_lag(tmp_path, write_dataset):
         ClipSource(relative, GAP, action_column="action_followed")
     assert usual_column(relative) == "action"
     dataset = RGBDDataset(write_dataset(tmp_path / "absolute", [12, 12], action_aggregation=["last"] * 7))
-    assert usual_column(dataset) == "action_followed"
+    assert usual_column(dataset) == "action"  # nothing is known of joints
     commands = dataset.load("action").astype(np.float64)
     share = 1 - np.exp(-1 / (dataset.attrs["control_rate"] * FOLLOWING_SECONDS))
     places = np.empty((25, 7))

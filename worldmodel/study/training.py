@@ -20,6 +20,7 @@ from worldmodel.checkpoint import STATE, WEIGHTS
 from worldmodel.study.options import StudyOptions
 from worldmodel.study.plan import Contestant
 from worldmodel.train import command, existing_run, parse_options
+from worldmodel.training_data import settled
 
 _PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 
@@ -68,7 +69,7 @@ def progress_of(options: StudyOptions, contestant: Contestant) -> Progress | Non
     Raises:
         UsageError: the folder holds a run with other options.
     """
-    run = existing_run(parse_options(arguments_of(options, contestant)))
+    run = existing_run(settled(parse_options(arguments_of(options, contestant))))
     states = sorted(folder_of(options, contestant).glob(f"checkpoints/step-????????/{STATE}"))
     if run is None or not states:
         return None

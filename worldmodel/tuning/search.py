@@ -13,7 +13,7 @@ from data_collection.ray_cluster import connect
 from envs.errors import UsageError
 from worldmodel.clips import ClipSource
 from worldmodel.train import document_of
-from worldmodel.training_data import open_data
+from worldmodel.training_data import open_data, settled
 from worldmodel.tuning import journal
 from worldmodel.tuning.options import TuneOptions
 from worldmodel.tuning.space import axes_of, point_of
@@ -36,7 +36,7 @@ def settle(options: TuneOptions) -> Data:
     Raises:
         UsageError: the data does not do, or the folder holds another search.
     """
-    training = options.training
+    training = settled(options.training)
     data = open_data(training)
     document: dict[str, Any] = {
         "options": options.document(),
@@ -101,7 +101,7 @@ def _tuner(options: TuneOptions, data: Data) -> Any:
     from worldmodel.tuning.trial import run_trial
     from worldmodel.tuning.watcher import Watcher
 
-    training, axes = options.training, axes_of(options.training)
+    training, axes = settled(options.training), axes_of(options.training)
     validation = data[1]
     if validation.source.dataset.has_ground_truth:  # read what its scores need now, once, not in every trial
         validation.source.truth_at(validation.source.spread(1, validation.frames), validation.frames)
