@@ -21,8 +21,8 @@ from worldmodel.train import main, parse_options
 HERE = Path(__file__).parent
 STEPS, HALF = 8, 4
 OPTIONS = ["--preset", "tiny", "--steps", STEPS, "--save-every", HALF, "--validate-every", STEPS, "--batch", 4]
-# Adam makes whole steps of gradients that are rounding. So masks have motions to tell apart from the first step on, and the
-# KL counts from the first step in which latents are inferred.
+# Adam makes whole steps of gradients that are rounding. So masks have motions to tell apart from the first step on, and
+# the KL counts from the first step in which latents are inferred.
 OPTIONS += ["--architecture.first-shift", 1, "--schedule.posterior-from", 0.3]
 OPTIONS = [str(option) for option in OPTIONS]
 
