@@ -87,6 +87,18 @@ def test_the_space_is_the_papers_and_only_what_matters_to_a_model_is_searched():
     assert at_point(TINY, own) == TINY
 
 
+def test_a_search_around_the_preset_leaves_what_is_0_at_0(tmp_path):
+    training = replace(TINY, losses=replace(TINY.losses, knn=0.0))
+    axes = axes_of(training, 3.0)
+    own = point_of(training, axes)
+    assert {axis.name for axis in axes} == {axis.name for axis in axes_of(training)} - {"knn"}
+    for axis in axes:
+        assert (axis.low, axis.high) == pytest.approx((own[axis.name] / 3, own[axis.name] * 3))
+    trial = at_point(training, draw(axes, np.random.default_rng(0)))
+    assert trial.losses.knn == 0 and trial.losses.rgb != training.losses.rgb
+    assert TuneOptions("d", tmp_path, around=3.0).document()["around"] == 3.0
+
+
 def random_searcher():
     axes = axes_of(TINY)
     searcher = make_searcher("random", axes, point_of(TINY, axes), (1, 3, 9), seed=3)
@@ -168,6 +180,7 @@ def test_a_search_that_goes_on_remembers_its_rungs(tmp_path):
         (["--steps", "8"], ["steps is 8", "too few for 2 rungs", "at least 9"]),
         (["--workers", "0"], ["workers is 0"]),
         (["--retries", "-1"], ["retries is -1"]),
+        (["--around", "1"], ["around is 1", "above 1"]),
         (["--searcher", "guess"], ["guess"]),
         (["--config", "/nowhere/best.json"], ["/nowhere/best.json", "cannot be read"]),
     ],

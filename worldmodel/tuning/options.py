@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -49,6 +50,8 @@ class TuneOptions:
     unpruned: int = 1
     """So many trials run to the end whatever their scores: the first has the preset's values, and some more tell how
     well small budgets foretell the full one (12 for a figure)."""
+    around: float | None = None
+    """Search within this factor of the preset's values (3: from a third to three times), not in the paper's ranges."""
     searcher: Literal["random", "bohb", "hebo"] = "random"
     """Where configurations come from; bohb and hebo need packages of their own."""
     seed: int = 0
@@ -72,6 +75,8 @@ class TuneOptions:
                 raise UsageError(f"{name.replace('_', '-')} is {getattr(self, name)}; give at least {least}")
         if self.unpruned > self.trials:
             raise UsageError(f"unpruned is {self.unpruned} of {self.trials} trials; give fewer, or more --trials")
+        if self.around is not None and not 1 < self.around < math.inf:
+            raise UsageError(f"around is {self.around:g}; give a factor above 1, such as 3")
         if self.workers is not None and self.workers < 1:
             raise UsageError(f"workers is {self.workers}; give at least 1")
 

@@ -44,7 +44,7 @@ def settle(options: TuneOptions) -> Data:
         "shared": options.shared,
         "data": {"train": data[0].dataset.content_hash, "validation": data[1].source.dataset.content_hash},
         "budgets": options.budgets,
-        "axes": {axis.name: [axis.low, axis.high] for axis in axes_of(training)},
+        "axes": {axis.name: [axis.low, axis.high] for axis in axes_of(training, options.around)},
     }
     document = json.loads(json.dumps(document))
     path = options.out / SETTINGS
@@ -101,7 +101,8 @@ def _tuner(options: TuneOptions, data: Data) -> Any:
     from worldmodel.tuning.trial import run_trial
     from worldmodel.tuning.watcher import Watcher
 
-    training, axes = settled(options.training), axes_of(options.training)
+    training = settled(options.training)
+    axes = axes_of(training, options.around)
     validation = data[1]
     if validation.source.dataset.has_ground_truth:  # read what its scores need now, once, not in every trial
         validation.source.truth_at(validation.source.spread(1, validation.frames), validation.frames)

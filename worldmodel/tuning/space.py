@@ -33,13 +33,23 @@ WEIGHTS = tuple(
 """lambda_1 to lambda_6."""
 
 
-def axes_of(training: TrainOptions) -> tuple[Axis, ...]:
-    """The logarithmic axes that matter for a model: a model of pictures has no depth, a deterministic one no KL."""
+def axes_of(training: TrainOptions, around: float | None = None) -> tuple[Axis, ...]:
+    """The logarithmic axes that matter for a model: a model of pictures has no depth, a deterministic one no KL.
+
+    Args:
+        training: the options that the search begins with.
+        around: search from each of their values divided by this to the value times this, a weight of 0 not at all;
+            without it the paper's ranges.
+    """
     kind, architecture = named_config(training.model, training.architecture)
     weights = {axis.name for axis in WEIGHTS} if kind == "t3vip" else {"rgb", "kl"}
     if architecture.latents == "none":
         weights -= {"kl"}
-    return (LEARNING_RATE, *(axis for axis in WEIGHTS if axis.name in weights))
+    axes = (LEARNING_RATE, *(axis for axis in WEIGHTS if axis.name in weights))
+    if around is None:
+        return axes
+    values = point_of(training, axes)
+    return tuple(Axis(axis.name, v / around, v * around) for axis in axes if (v := values[axis.name]))
 
 
 def draw(axes: tuple[Axis, ...], rng: np.random.Generator) -> Point:
