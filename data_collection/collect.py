@@ -57,8 +57,8 @@ class Config:
     policy: str | None = None
     """Who acts: play (a script for the tabletop), push and poke (for planar-push: pushes as in Omnipush, or mixed with
     moves that miss), predictive (a search in the simulator, for dexhand), noise (smooth), random (uniform); usually the
-    environment's own. Or the .zip of any policy that Stable-Baselines3 trained, as train-policy makes it; loading one
-    runs code that is in it."""
+    environment's own. Or the .zip of a policy that Stable-Baselines3 trained on dictionaries, as train-policy makes it;
+    loading one runs code that is in it."""
     seed: int = 0
     """With the number of an episode it fixes that episode, whatever the number of workers."""
     workers: int = 2

@@ -125,7 +125,7 @@ def describe(source: Source) -> dict[str, Any]:
     """The attributes of a shard that follow from the source."""
     return {
         "env_id": source.env_id,
-        "env_kwargs": {},
+        "env_kwargs": {"split": source.split} if source.split else {},
         "policy": "recorded",
         "seed": 0,
         "control_rate": source.control_rate,
@@ -146,6 +146,7 @@ def _content(config: Config, source: Source) -> dict[str, Any]:
         "env_id": source.env_id,
         "split": source.split,
         "camera": source.camera.to_dict(),
+        "action_aggregation": list(source.action_aggregation),
         "depth_scale": config.depth_scale,
         "steps": config.steps,
     }

@@ -45,9 +45,10 @@ def open_data(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
             raise UsageError(
                 f"{opened.path} comes from {TEST_ONLY}, the test scene; train and validate on scene A, B or C"
             )
-        if _has_test_objects(opened):
+        if _is_for_testing(opened):
             raise UsageError(
-                f"{opened.path} holds objects for testing only; collect with --scene train and --scene validation"
+                f"{opened.path} is for testing only; collect objects with --scene train and --scene validation, import "
+                "another --split"
             )
     limit = _memory_limit(options)
     column = settled(options).action_column
@@ -78,7 +79,7 @@ def _memory_limit(options: TrainOptions) -> float:
     return FREE_SHARE * available_memory() / processes_here()
 
 
-def _has_test_objects(dataset: RGBDDataset) -> bool:
+def _is_for_testing(dataset: RGBDDataset) -> bool:
     kwargs = dataset.attrs["env_kwargs"]
     one = kwargs.get("object") if "PlanarPush" in str(dataset.attrs["env_id"]) else None
     return kwargs.get("split") in TEST_SPLITS or (one is not None and canonical(one) in SPLITS["test"])

@@ -81,7 +81,8 @@ class DepthCheck:
         sample = np.asarray(metres[::step, ::step], np.float32)
         valid = sample[(sample > 0) & (sample < self._ceiling)]
         if valid.size == 0:
-            raise Damaged(f"no pixel of frame {len(self._medians)} has a depth")
+            end = "; all that it holds is at the end of its scale: doubled?" if (sample > 0).any() else ""
+            raise Damaged(f"no pixel of frame {len(self._medians)} has a depth{end}")
         self._medians.append(float(np.median(valid)))
         self._greatest = max(self._greatest, float(valid.max()))
         near, far = self._camera.near, self._camera.far

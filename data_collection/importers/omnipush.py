@@ -49,7 +49,7 @@ class OmnipushSource(PngFolders):
             tip = np.load(folder / ACTIONS, allow_pickle=False)
         except FileNotFoundError:
             raise Damaged(f"{ACTIONS} is missing") from None
-        except (OSError, ValueError, EOFError) as error:
+        except Exception as error:  # what a flipped byte makes of a file has many names
             raise Damaged(f"{ACTIONS} does not unpack ({type(error).__name__})") from error
         check_array(tip, ACTIONS, "float", (count, 3))
         notes = [] if count % PUSH_FRAMES == 0 else [f"{count} frames, not a multiple of {PUSH_FRAMES}"]

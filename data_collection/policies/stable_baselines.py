@@ -70,6 +70,13 @@ class StableBaselinesPolicy:
                 f"{self._path} observes {missing or wanted}, which this environment does not offer (it has "
                 f"{', '.join(offered)}); train the policy in the environment that it shall act in"
             )
+        for key in self._keys:
+            if not _same_shape(wanted[key], offered[key]):
+                raise UsageError(
+                    f"{self._path} observes {key} of shape {wanted[key].shape}, this environment has "
+                    f"{offered[key].shape}; give the environment that the policy was trained in (--image-size for rgb "
+                    "and depth)"
+                )
         if action.shape != env.action_space.shape:
             raise UsageError(
                 f"{self._path} gives actions {action.shape}, the environment takes {env.action_space.shape}"
@@ -78,6 +85,12 @@ class StableBaselinesPolicy:
     def act(self, obs: dict[str, Any]) -> NDArray[Any]:
         """The action that the policy thinks best."""
         return self._model.predict({key: obs[key] for key in self._keys}, deterministic=True)[0]
+
+
+def _same_shape(wanted: gymnasium.Space, offered: gymnasium.Space) -> bool:
+    """Whether they agree; Stable-Baselines3 trains on pictures with their channels first, and turns ours round."""
+    shape = wanted.shape or ()
+    return offered.shape in (shape, (*shape[1:], *shape[:1]))
 
 
 @functools.lru_cache(maxsize=1)  # a worker makes a new policy for each episode
@@ -105,7 +118,7 @@ def load_model(path: Path, device: str = "cpu", **changes: Any) -> Any:
         package, algorithm = ALGORITHMS[module]
         loader = getattr(importlib.import_module(package), algorithm)
         return loader.load(path, device=device, **(changes or {"custom_objects": NOT_NEEDED}))
-    except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError, ImportError) as error:
+    except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError, ImportError, AttributeError) as error:
         known = ", ".join(name for _, name in ALGORITHMS.values())
         raise UsageError(f"{path} is no policy that can be loaded here ({error!r}); give a zip of {known}") from error
 

@@ -59,18 +59,23 @@ def test_a_damaged_calvin_frame_costs_its_episode(tmp_path, kind):
 
 
 def test_damaged_calvin_files(tmp_path):
-    folder = write_calvin(tmp_path / "task_D_D", [(0, 2), (3, 5), (6, 8), (9, 11), (20, 20)])
+    folder = write_calvin(tmp_path / "task_D_D", [(0, 2), (3, 5), (6, 8), (9, 11), (20, 20), (30, 32)])
     (folder / "episode_0000001.npz").unlink()
     half = folder / "episode_0000004.npz"
     half.write_bytes(half.read_bytes()[:2000])
+    unknown = folder / "episode_0000010.npz"  # its directory of files says that they are packed in method 99
+    content = unknown.read_bytes()
+    place = content.index(b"PK\x01\x02") + 10
+    unknown.write_bytes(content[:place] + bytes([99]) + content[place + 1 :])
     np.save(folder / "other.npy", np.zeros(3))
     (folder / "other.npy").rename(folder / "episode_0000007.npz")
-    np.save(folder / "ep_lens.npy", np.array([3, 3, 3, 4, 1]))
+    np.save(folder / "ep_lens.npy", np.array([3, 3, 3, 4, 1, 3]))
     report = report_of("calvin", folder, tmp_path / "data")
     assert report[0] == ("damaged", "episode_0000001.npz is missing")
     assert "episode_0000004.npz does not unpack" in report[1][1]
     assert "episode_0000007.npz is no npz" in report[2][1]
-    assert report[3] == ("imported", "") and report[4] == ("damaged", "1 frames are no episode")
+    assert "episode_0000010.npz does not unpack (NotImplementedError)" in report[3][1]
+    assert report[5] == ("imported", "") and report[4] == ("damaged", "1 frames are no episode")
     assert "ep_lens.npy does not follow" in json.loads((tmp_path / "data" / "import.json").read_text())["notes"][0]
 
 
@@ -154,15 +159,21 @@ def test_odd_frame_counts_are_noted(tmp_path):
 
 
 def test_damaged_omnipush(tmp_path):
-    root = write_omnipush(tmp_path / "omnipush", ["1a1a1a1a"], pushes=6)
-    pushes = [root / "train" / "1a1a1a1a" / str(i) for i in range(6)]
+    root = write_omnipush(tmp_path / "omnipush", ["1a1a1a1a"], pushes=8)
+    pushes = [root / "train" / "1a1a1a1a" / str(i) for i in range(8)]
     (pushes[1] / "actions.npy").unlink()
     np.save(pushes[2] / "actions.npy", np.zeros((11, 3)))
     np.save(pushes[3] / "actions.npy", np.full((12, 3), np.nan))
     np.save(pushes[4] / "actions.npy", np.full((12, 3), 300.0))
     for i in range(12):
         write_png(pushes[5] / f"depthsub{i}.png", np.full((48, 48), 1100, np.uint16))
+    for i in range(12):
+        write_png(pushes[6] / f"depthsub{i}.png", np.full((48, 48), 65535, np.uint16))  # where doubling ends
+    actions = pushes[7] / "actions.npy"
+    actions.write_bytes(actions.read_bytes().replace(b"{'descr'", b"{'descr("))
     report = report_of("omnipush", root, tmp_path / "data")
+    assert report[6][0] == "damaged" and "at the end of its scale: doubled?" in report[6][1]
+    assert report[7][0] == "damaged" and "actions.npy does not unpack" in report[7][1]
     assert report[0] == ("imported", "") and report[1] == ("damaged", "actions.npy is missing")
     assert report[2] == ("damaged", "actions.npy is float64 (11, 3), not float (12, 3)")
     assert report[3] == ("damaged", "actions.npy has values that are not finite")

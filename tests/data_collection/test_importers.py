@@ -1,6 +1,7 @@
 """What stands in the public layouts arrives in the dataset: pictures, camera, actions and states."""
 
 import json
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -9,13 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from layouts import change_frame, write_calvin, write_dexhand, write_intrinsics, write_omnipush
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from data_collection.actions import aggregate_actions
 from data_collection.dataset import RGBDDataset
 from data_collection.importers.images import average_colour, nearest_depth, resize_camera
 from envs.camera import CameraModel
 from envs.errors import UsageError
+from worldmodel.train import parse_options
+from worldmodel.training_data import open_data
 
 
 def imported(form, source, folder, *options):
@@ -94,11 +96,11 @@ def test_calvin_actions_add_up_over_a_gap(calvin, tmp_path):
     dataset = imported("calvin", calvin, tmp_path / "data", "--image-size", "8")
     actions = dataset.episode(0)["action"][3:6].astype(float)
     total = aggregate_actions(actions, dataset.attrs["action_aggregation"], dataset.attrs["action_scale"])
-    turn = Rotation.identity()
+    place, angles = np.zeros(3), np.zeros(3)  # of the target, which calvin_env moves so
     for action in actions:
-        turn = Rotation.from_euler("xyz", 0.05 * action[3:6]) * turn
-    np.testing.assert_allclose(0.02 * total[:3], 0.02 * actions[:, :3].sum(0), atol=1e-9)
-    np.testing.assert_allclose(0.05 * total[3:6], turn.as_euler("xyz"), atol=1e-9)
+        place, angles = place + 0.02 * action[:3], angles + 0.05 * action[3:6]
+    np.testing.assert_allclose(0.02 * total[:3], place, atol=1e-9)
+    np.testing.assert_allclose(0.05 * total[3:6], angles, atol=1e-9)
     assert total[6] == actions[-1, 6] != actions[0, 6]
 
 
@@ -139,6 +141,16 @@ def test_omnipush_arrives(tmp_path):
     np.testing.assert_allclose(total, tip[5], atol=1e-6)
     depth = dataset.depth_metres(episode["depth"])
     assert depth.min() == pytest.approx(1.0, abs=1e-4) and depth.max() == pytest.approx(1.1, abs=1e-4)
+
+
+def test_a_test_split_is_not_trained_on(tmp_path):
+    for split, refused in (("test", True), ("train", False)):
+        root = write_omnipush(tmp_path / split, split=split)
+        dataset = imported("omnipush", root, tmp_path / f"{split}-data", "--image-size", "16")
+        assert dataset.attrs["env_kwargs"] == {"split": split}
+        options = parse_options(["--preset", "tiny", "--data", str(dataset.path), "--out", str(tmp_path / "run")])
+        with pytest.raises(UsageError, match="for testing only") if refused else nullcontext():
+            open_data(options)
 
 
 def test_omnipush_without_intrinsics_takes_the_published_ones(tmp_path):

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import shlex
+from types import SimpleNamespace
 
+import gymnasium
 import imageio.v2 as imageio
 import numpy as np
 import pytest
@@ -276,6 +278,11 @@ def test_bad_policy_files_are_named(trained, tmp_path, env):
     other = PlanarPushEnv(images=False)
     with pytest.raises(UsageError, match="achieved_goal"):
         make_policy(policy_name(trained)).reset(other, np.random.default_rng(0))
+    spaces = dict(env.observation_space.spaces)
+    larger = SimpleNamespace(action_space=env.action_space, observation_space=gymnasium.spaces.Dict(spaces))
+    larger.observation_space["observation"] = gymnasium.spaces.Box(-1, 1, (62,))
+    with pytest.raises(UsageError, match=r"observes observation of shape \(61,\), this environment has \(62,\)"):
+        make_policy(policy_name(trained)).reset(larger, np.random.default_rng(0))
     other.close()
     for arguments, named in (
         (["--out", "x.zip", "--env", "planar-push"], "has no goals"),

@@ -58,7 +58,7 @@ def test_drawer_setups_are_what_they_promise(table):
         observation = setup.start(table)
         np.testing.assert_allclose(setup.mark.position(table), setup.goal.designated, atol=1e-9)
         way = setup.goal.point_world - setup.goal.designated
-        assert np.abs(way[[0, 2]]).max() < 1e-9 and (setup.part == "open") == (way[1] < 0)
+        assert np.abs(way[[0, 2]]).max() < 1e-9 and (setup.part == "open") == (way[1] < 0) == (index == 0)
         middle = gap(table.unwrapped)
         assert np.abs((table.unwrapped.tcp_position - middle)[:2]).max() < 0.03 and observation["proprio"][14] == -1
 

@@ -166,10 +166,10 @@ def test_data_that_does_not_do(train, write_dataset, camera_of, tmp_path):
     assert_one_line(train(data=test_scene), "TabletopD-v0", "test scene")
     assert_one_line(train("--validation", test_scene), "TabletopD-v0", "test scene")
     test_objects = write_dataset(tmp_path / "objects", [12, 12], env_kwargs={"split": "test"})
-    assert_one_line(train(data=test_objects), "objects", "for testing only")
+    assert_one_line(train(data=test_objects), str(test_objects), "for testing only")
     one = {"split": "train", "object": SPLITS["test"][0]}
     test_object = write_dataset(tmp_path / "object", [12, 12], env_id="t3vip/PlanarPush-v0", env_kwargs=one)
-    assert_one_line(train(data=test_object), "object", "for testing only")
+    assert_one_line(train(data=test_object), str(test_object), "for testing only")
     assert_one_line(train(data=write_dataset(tmp_path / "one", [30])), "1 episode", "--validation")
     odd = write_dataset(tmp_path / "odd", [12, 12], camera_of(20, 12))
     assert_one_line(train(data=odd), "12x20 is no multiple of 8")
