@@ -14,6 +14,7 @@ Size = dict[str, Any]  # arguments of a subject
 PLAN_LIMIT_S = 0.4
 BEST_OF_LIMIT_S = 20.0
 WAIT_LIMIT_PERCENT = 5.0
+PUSH_STEPS_LEAST = 300
 KNN_RADIUS = 5  # the presets'
 
 
@@ -23,6 +24,40 @@ def tabletop_rgbd_steps(quick: bool) -> Result:
     stock = measure("rendering.robosuite_steps", 1, _same_opengl(), steps=2 if quick else 30, repeats=1 if quick else 5)
     what = "robosuite's camera path (Lift, Panda, OSC_POSE, one 64x64 camera with depth, 30 Hz), one core"
     return rate("tabletop_rgbd_steps", ours, "steps/s", stock, what)
+
+
+def dexhand_rgbd_steps(quick: bool) -> Result:
+    """Control steps of the hand with RGB-D on one core, without a policy."""
+    size: Size = {"steps": 2 if quick else 100, "repeats": 1 if quick else 5}
+    ours = measure("rendering.dexhand_steps", cores=1, **size)
+    stock = measure("rendering.manipulate_block_steps", 1, _same_opengl(), **size)
+    what = "gymnasium-robotics' HandManipulateBlock, 64x64 picture and depth after each step, one core"
+    return rate("dexhand_rgbd_steps", ours, "steps/s", stock, what)
+
+
+def planar_push_rgbd_steps(quick: bool) -> Result:
+    """Control steps of the pusher with RGB-D on one core, without a policy."""
+    size: Size = {"steps": 2 if quick else 200, "repeats": 1 if quick else 5}
+    ours = measure("rendering.planar_push_steps", cores=1, **size)
+    return rate("planar_push_rgbd_steps", ours, "steps/s", PUSH_STEPS_LEAST, "the least wanted, one core")
+
+
+def import_calvin(quick: bool) -> Result:
+    """Importing a gigabyte in CALVIN's layout by one process."""
+    size: Size = {"frames": 4, "size": 64} if quick else {"frames": 3600, "size": 200}
+    found = measure("importing.import_speed", cores=1, **size)
+    what = f"reading and unpacking the same arrays alone; {found['gigabytes']:.2g} GB"
+    return rate("import_calvin", found["import"], "GB/s", found["unpack"], what)
+
+
+def import_memory(quick: bool) -> Result:
+    """Peak memory of importing, by one process."""
+    frames = (4, 8) if quick else (241, 1205)
+    size = 64 if quick else 200
+    few, many = (
+        measure("importing.import_mebibytes", 1, MMAP_EVERYTHING, frames=number, size=size) for number in frames
+    )
+    return cost("import_memory", many, "MiB", few, f"{frames[0]} frames; this with {frames[1]}")
 
 
 def rgbd_frames(quick: bool) -> Result:
@@ -125,8 +160,12 @@ BENCHMARKS: dict[str, Callable[[bool], Result]] = {
     function.__name__: function
     for function in (
         tabletop_rgbd_steps,
+        dexhand_rgbd_steps,
+        planar_push_rgbd_steps,
         rgbd_frames,
         collect,
+        import_calvin,
+        import_memory,
         knn_loss,
         knn_loss_memory,
         knn_against_chamfer,

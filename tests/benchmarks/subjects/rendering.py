@@ -32,6 +32,40 @@ def tabletop_steps(steps: int, repeats: int) -> float:
     return _steps_a_second(env.step, 7, steps, repeats)
 
 
+def dexhand_steps(steps: int, repeats: int) -> float:
+    """Control steps a second of the hand with supersampled RGB-D, under random commands."""
+    return _env_steps("t3vip/DexHand-v0", 20, steps, repeats)
+
+
+def planar_push_steps(steps: int, repeats: int) -> float:
+    """Control steps a second of the pusher with supersampled RGB-D, under random moves."""
+    return _env_steps("t3vip/PlanarPush-v0", 3, steps, repeats)
+
+
+def manipulate_block_steps(steps: int, repeats: int) -> float:
+    """Control steps a second of the hand as gymnasium-robotics has it: 25 Hz, too, picture and depth each time."""
+    import gymnasium_robotics
+
+    gymnasium.register_envs(gymnasium_robotics)
+    env = gymnasium.make(
+        "HandManipulateBlock-v1",
+        render_mode="rgb_array",
+        width=SIZE,
+        height=SIZE,
+        max_episode_steps=-1,
+        disable_env_checker=True,
+    )
+    env.reset(seed=0)
+    renderer = env.unwrapped.mujoco_renderer  # type: ignore[attr-defined]
+
+    def step(action: np.ndarray) -> None:
+        env.step(action)
+        picture, depth = renderer.render("rgb_array"), renderer.render("depth_array")
+        assert picture.shape == (SIZE, SIZE, 3) and depth.shape == (SIZE, SIZE)
+
+    return _steps_a_second(step, 20, steps, repeats)
+
+
 def robosuite_steps(steps: int, repeats: int) -> float:
     """Control steps a second of robosuite as it comes: a Panda, operational space control, one camera with depth.
 
@@ -92,6 +126,12 @@ def _tabletop() -> Any:
     env = gymnasium.make("t3vip/TabletopC-v0", image_size=SIZE, disable_env_checker=True)
     env.reset(seed=0)
     return env.unwrapped
+
+
+def _env_steps(env_id: str, action_dim: int, steps: int, repeats: int) -> float:
+    env = gymnasium.make(env_id, image_size=SIZE, max_episode_steps=-1, disable_env_checker=True)
+    env.reset(seed=0)
+    return _steps_a_second(env.step, action_dim, steps, repeats)
 
 
 def _steps_a_second(step: Callable[[np.ndarray], Any], action_dim: int, steps: int, repeats: int) -> float:
