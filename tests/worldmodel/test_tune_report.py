@@ -10,6 +10,8 @@ from envs.command import run
 from worldmodel.train import parse_options
 from worldmodel.tune_report import ReportOptions, main
 from worldmodel.tuning import journal
+from worldmodel.tuning.correlation import rank_correlations
+from worldmodel.tuning.journal import Trial
 from worldmodel.tuning.report import FILES
 from worldmodel.tuning.space import WEIGHTS
 
@@ -68,11 +70,29 @@ def test_rank_correlations_are_spearmans_with_counts(out):
     unpruned = {tuple(pair["budgets"]): pair for pair in document["rank_correlation"]["unpruned"]}
     assert {pair: found["r"] for pair, found in unpruned.items()} == pytest.approx(EXPECTED)
     assert {found["n"] for found in unpruned.values()} == {5}
-    assert unpruned[3, 9]["p"] == pytest.approx(0.0374, abs=1e-4) and unpruned[3, 27]["p"] > 0.3
+    assert unpruned[3, 9]["p"] == pytest.approx(10 / 120)  # as tables have it for n = 5
     every = {tuple(pair["budgets"]): pair for pair in document["rank_correlation"]["all"]}
     assert {pair: found["n"] for pair, found in every.items()} == {(3, 9): 6, (3, 27): 5, (9, 27): 5}
     assert every[3, 9]["r"] < 0.5  # the one that diverged fell from the first place to the last
     assert document["shown_of"] == "unpruned"
+
+
+@pytest.mark.parametrize(
+    ("second", "r", "p"),
+    [
+        ([1, 2, 3], 1.0, 1 / 3),  # of six orders the right one and its reverse
+        ([4, 3, 2, 1], -1.0, 1 / 12),
+        ([1, 2, 4, 3], 0.8, 1 / 3),
+        ([1, 2, 3, 4, 5], 1.0, 1 / 60),
+        ([1, 1, 2], 3**0.5 / 2, 2 / 3),  # tied: four of six orders are as extreme
+        (list(range(12)), 1.0, 0.0),  # as the t-distribution has it
+        ([7, 7, 7, 7], None, None),
+    ],
+)
+def test_p_values_of_few_trials_are_exact(second, r, p):
+    scored = [Trial(number, scores={1: float(number), 2: float(then)}) for number, then in enumerate(second)]
+    (pair,) = rank_correlations(scored, (1, 2))
+    assert pair == {"budgets": [1, 2], "r": r and pytest.approx(r), "p": p and pytest.approx(p), "n": len(second)}
 
 
 def test_the_best_of_those_that_ran_to_the_end_is_what_train_worldmodel_takes(out):
@@ -85,7 +105,7 @@ def test_the_best_of_those_that_ran_to_the_end_is_what_train_worldmodel_takes(ou
     for axis in WEIGHTS:
         assert getattr(options.losses, axis.name) == point(2)[axis.name]
     text = (out / "report.md").read_text()
-    assert "trial 2, 40.00 dB, +3.00 dB against trial 0" in text and "| 3 and 9 | 0.900 | 0.037 | 5 |" in text
+    assert "trial 2, 40.00 dB, +3.00 dB against trial 0" in text and "| 3 and 9 | 0.900 | 0.083 | 5 |" in text
 
 
 def test_pictures(out):

@@ -8,12 +8,15 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from scipy.stats import spearmanr
+import numpy as np
+from scipy.stats import rankdata, spearmanr
 
 from worldmodel.tuning.journal import Trial
 
 FEWEST = 3
 """Configurations from which a rank correlation can be told."""
+MOST_ENUMERATED = 9
+"""Configurations up to which p-values are exact; with more, the t-distribution comes near to them."""
 
 
 def rank_correlations(trials: Sequence[Trial], budgets: Sequence[int]) -> list[dict[str, Any]]:
@@ -24,17 +27,15 @@ def rank_correlations(trials: Sequence[Trial], budgets: Sequence[int]) -> list[d
         budgets: steps, rising.
 
     Returns:
-        For each pair: `budgets`; `n`, the trials that count; `r` and `p` (two-sided, of no correlation), None with
-        fewer than three trials or where all scores are equal.
+        For each pair: `budgets`; `n`, the trials that count; `r` and `p` (two-sided, of no correlation; exact for few
+        trials), None with fewer than three trials or where all scores are equal.
     """
     pairs = []
     for low, high in itertools.combinations(budgets, 2):
         both = [trial for trial in trials if low in trial.scores and high in trial.scores]
         r = p = math.nan
         if len(both) >= FEWEST:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # constant scores: the answer is NaN
-                r, p = spearmanr([t.scores[low] for t in both], [t.scores[high] for t in both])
+            r, p = _spearman([t.scores[low] for t in both], [t.scores[high] for t in both])
         pairs.append({"budgets": [low, high], "r": _number(r), "p": _number(p), "n": len(both)})
     return pairs
 
@@ -42,6 +43,23 @@ def rank_correlations(trials: Sequence[Trial], budgets: Sequence[int]) -> list[d
 def written(p: float) -> str:
     """A p-value for people: none is 0."""
     return "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def _spearman(first: Sequence[float], second: Sequence[float]) -> tuple[float, float]:
+    """r and p; NaN where either does not vary."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # constant scores: the answer is NaN
+        r, p = spearmanr(first, second)
+    if math.isfinite(r) and len(first) <= MOST_ENUMERATED:
+        p = _exact_p(rankdata(first), rankdata(second))
+    return r, p
+
+
+def _exact_p(first: Any, second: Any) -> float:
+    """The share of all orders of the second ranks that correlate with the first as much as they do, or more."""
+    first = first - first.mean()
+    orders = np.array(list(itertools.permutations(second)))
+    return float(np.mean(abs(orders @ first) >= abs(second @ first) - 1e-9))
 
 
 def _number(value: float) -> float | None:
