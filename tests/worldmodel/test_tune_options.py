@@ -87,20 +87,46 @@ def test_the_space_is_the_papers_and_only_what_matters_to_a_model_is_searched():
     assert at_point(TINY, own) == TINY
 
 
-def test_a_search_around_the_preset_leaves_what_is_0_at_0(tmp_path):
+@pytest.mark.parametrize("around", [None, 3.0])
+def test_a_term_that_is_off_stays_off(around):
     training = replace(TINY, losses=replace(TINY.losses, knn=0.0))
-    axes = axes_of(training, 3.0)
-    own = point_of(training, axes)
-    assert {axis.name for axis in axes} == {axis.name for axis in axes_of(training)} - {"knn"}
-    for axis in axes:
-        assert (axis.low, axis.high) == pytest.approx((own[axis.name] / 3, own[axis.name] * 3))
+    axes = axes_of(training, around)
+    assert {axis.name for axis in axes} == {axis.name for axis in axes_of(TINY)} - {"knn"}
     trial = at_point(training, draw(axes, np.random.default_rng(0)))
     assert trial.losses.knn == 0 and trial.losses.rgb != training.losses.rgb
-    assert TuneOptions("d", tmp_path, around=3.0).document()["around"] == 3.0
 
 
-def random_searcher():
-    axes = axes_of(TINY)
+def test_a_search_around_the_preset_draws_near_its_values():
+    axes = axes_of(TINY, 3.0)
+    searcher = random_searcher(axes)
+    own, *drawn = [searcher.suggest(f"a{i}") for i in range(60)]
+    for axis in axes:
+        factors = np.log([point[axis.name] / own[axis.name] for point in drawn]) / np.log(3)
+        assert -1 <= factors.min() < -0.8 and 0.8 < factors.max() <= 1, axis.name
+
+
+def test_the_folder_says_what_is_searched(tune_with):
+    assert tune_with("--around", 3)[0] == 130
+    axes = json.loads((tune_with.out / "tune.json").read_text())["axes"]
+    assert axes["learning_rate"] == pytest.approx([TINY.learning_rate / 3, TINY.learning_rate * 3])
+    assert axes["kl"] == pytest.approx([TINY.losses.kl / 3, TINY.losses.kl * 3])
+    assert_one_line(tune_with("--around", 2), "around = 3.0, not 2.0", "another --out")
+    assert_one_line(tune_with(), "around = 3.0, not None")
+
+
+def test_a_search_from_before_there_was_around_goes_on_without(tune_with):
+    assert tune_with()[0] == 130
+    path = tune_with.out / "tune.json"
+    settings = json.loads(path.read_text())
+    assert settings["axes"]["kl"] == [1e-3, 1.0]
+    del settings["options"]["around"]
+    path.write_text(json.dumps(settings))
+    assert tune_with()[0] == 130
+    assert_one_line(tune_with("--around", 3), "around = None, not 3.0", "another --out")
+
+
+def random_searcher(axes=None):
+    axes = axes or axes_of(TINY)
     searcher = make_searcher("random", axes, point_of(TINY, axes), (1, 3, 9), seed=3)
     assert searcher.set_search_properties("score", "max", ray_space(axes))
     return searcher

@@ -1,6 +1,7 @@
 """`tune-report`: known rank correlations, the winner, and pictures, from hand-made results."""
 
 import json
+import warnings
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from worldmodel.train import parse_options
 from worldmodel.tune_report import ReportOptions, main
 from worldmodel.tuning import journal
 from worldmodel.tuning.correlation import rank_correlations
+from worldmodel.tuning.figures import _Scale
 from worldmodel.tuning.journal import Trial
 from worldmodel.tuning.report import FILES
 from worldmodel.tuning.space import WEIGHTS
@@ -114,6 +116,18 @@ def test_pictures(out):
         with Image.open(out / name) as picture:
             assert np.asarray(picture.convert("L")).std() > 10, name
     assert all((out / name).exists() for name in FILES) and len(document["trials"]) == 8
+
+
+def test_a_trial_may_lack_an_axis_or_have_a_0_there(out):
+    odd = {name: value for name, value in point(1).items() if name != "depth"} | {"knn": 0.0}
+    results = out / journal.JOURNAL
+    results.write_text(results.read_text().replace(json.dumps(point(1)), json.dumps(odd)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # as of a logarithm of 0
+        assert report(out)["trials"][1]["point"] == odd
+    scale = _Scale(np.array([0.0, np.nan, 0.01, 1.0]), True)
+    assert [scale(value) for value in (0.01, 0.1, 1.0)] == pytest.approx([0, 0.5, 1])
+    assert np.isnan([scale(0.0), scale(np.nan)]).all()
 
 
 def test_an_unfinished_search_has_a_report_of_what_there_is(out):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -55,14 +56,12 @@ def draw_trials(document: Document, path: Path) -> None:
     shown = [trial for trial in document["trials"] if trial["score"] is not None]
     whole = {t["number"]: t["scores"][str(budgets[-1])] for t in shown if str(budgets[-1]) in t["scores"]}
     colour = Normalize(min(whole.values(), default=0.0), max(whole.values(), default=1.0))
-    scales = [
-        _Scale(np.array([*document["axes"][name], *(t["point"][name] for t in shown)]), True) for name in names[:-1]
-    ]
+    scales = [_Scale(np.array([*document["axes"][name], *(_at(t, name) for t in shown)]), True) for name in names[:-1]]
     scales += [_Scale(np.array([1.0, 2.0]), False), _Scale(np.array([t["score"] for t in shown]), False)]
     figure = Figure(figsize=(1.05 * len(scales), 3.6), layout="constrained")
     axes = figure.subplots()
     for trial in sorted(shown, key=lambda t: (t["number"] in whole, whole.get(t["number"], 0.0))):
-        values = [*(trial["point"][name] for name in names), trial["score"]]
+        values = [*(_at(trial, name) for name in names), trial["score"]]
         heights = [scale(value) for scale, value in zip(scales, values, strict=True)]
         done = trial["number"] in whole
         best = document["best"] is not None and document["trials"][document["best"]] is trial
@@ -88,13 +87,21 @@ def draw_trials(document: Document, path: Path) -> None:
     _save(figure, path)
 
 
+def _at(trial: Document, name: str) -> float:
+    """A trial's value on an axis; NaN where it has none, as trials of older searches."""
+    return float(trial["point"].get(name, math.nan))
+
+
 class _Scale:
-    """From values to [0, 1]."""
+    """From values to [0, 1]; NaN, a gap in a line, where a value has no place on the scale."""
 
     def __init__(self, values: Any, logarithmic: bool) -> None:
+        values = values[values > 0] if logarithmic else values
         self.low, self.high, self._logarithmic = float(values.min()), float(values.max()), logarithmic
 
     def __call__(self, value: float) -> float:
+        if self._logarithmic and not value > 0:
+            return math.nan
         low, high, value = (np.log(x) if self._logarithmic else x for x in (self.low, self.high, value))
         return float((value - low) / (high - low)) if high > low else 0.5
 

@@ -23,7 +23,8 @@ PLACEMENT = ("out", "workers", "retries", "ray")
 class TuneOptions:
     """Search for the learning rate and loss weights with which a world model learns best on a dataset.
 
-    The first trial has the preset's own values. The same command again goes on where it was.
+    The first trial has the preset's own values. A weight that is 0 there, or in the config file, stays 0. The same
+    command again goes on where it was.
     """
 
     data: Path

@@ -36,20 +36,22 @@ WEIGHTS = tuple(
 def axes_of(training: TrainOptions, around: float | None = None) -> tuple[Axis, ...]:
     """The logarithmic axes that matter for a model: a model of pictures has no depth, a deterministic one no KL.
 
+    A term of the objective that is off, with a weight of 0, stays off.
+
     Args:
         training: the options that the search begins with.
-        around: search from each of their values divided by this to the value times this, a weight of 0 not at all;
-            without it the paper's ranges.
+        around: search from each of their values divided by this to the value times this; without it the paper's ranges.
     """
     kind, architecture = named_config(training.model, training.architecture)
     weights = {axis.name for axis in WEIGHTS} if kind == "t3vip" else {"rgb", "kl"}
     if architecture.latents == "none":
         weights -= {"kl"}
     axes = (LEARNING_RATE, *(axis for axis in WEIGHTS if axis.name in weights))
+    values = point_of(training, axes)
+    axes = tuple(axis for axis in axes if values[axis.name] != 0)
     if around is None:
         return axes
-    values = point_of(training, axes)
-    return tuple(Axis(axis.name, v / around, v * around) for axis in axes if (v := values[axis.name]))
+    return tuple(Axis(axis.name, values[axis.name] / around, values[axis.name] * around) for axis in axes)
 
 
 def draw(axes: tuple[Axis, ...], rng: np.random.Generator) -> Point:
