@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -27,7 +28,7 @@ def begin(tiny_dataset, tmp_path, monkeypatch):
         column.flags.writeable = False  # as Ray's shared memory is
     threads = torch.get_num_threads()
 
-    def call(kill_at=math.inf, **changes):
+    def call(kill_at=math.inf, deterministic=False, **changes):
         told = []
 
         def report(result):
@@ -38,7 +39,8 @@ def begin(tiny_dataset, tmp_path, monkeypatch):
         monkeypatch.setattr(trials.tune, "report", report)
         point = point_of(training_options, axes_of(training_options)) | changes
         with contextlib.suppress(SystemExit):
-            trials.run_trial({**point, "number": 0}, training_options, data, threads)
+            shared = replace(training_options, deterministic=deterministic)
+            trials.run_trial({**point, "number": 0}, shared, data, threads)
         return told
 
     call.out = Path(training_options.out) / "000"
@@ -72,6 +74,17 @@ def test_another_configuration_in_the_folder_is_begun_anew(begin):
     other = begin(rgb=0.1)
     assert steps_of(other) == [3, STEPS] and trained(begin.out) == list(range(1, STEPS + 1))
     assert json.loads((begin.out / "config.json").read_text())["losses"]["rgb"] == 0.1
+
+
+def test_a_trial_is_deterministic_where_that_is_asked_for(begin):
+    begin(kill_at=3)
+    assert not torch.are_deterministic_algorithms_enabled() and torch.backends.cudnn.benchmark
+    try:
+        begin(kill_at=3, deterministic=True)
+        assert torch.are_deterministic_algorithms_enabled() and not torch.backends.cudnn.benchmark
+    finally:
+        torch.use_deterministic_algorithms(False)
+        torch.backends.cudnn.deterministic = False
 
 
 def test_a_loss_that_is_no_number_makes_a_bad_trial(begin, monkeypatch):

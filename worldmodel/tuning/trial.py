@@ -16,7 +16,7 @@ from ray import tune
 
 from envs.errors import UsageError
 from worldmodel.clips import ClipSource
-from worldmodel.devices import find_device
+from worldmodel.devices import find_device, prepare_devices
 from worldmodel.memory import keep_freed_memory
 from worldmodel.options import TrainOptions
 from worldmodel.ranks import Ranks
@@ -44,6 +44,7 @@ def run_trial(
         threads: to compute with.
     """
     keep_freed_memory()
+    prepare_devices(training.deterministic)
     torch.set_num_threads(threads)
     point = {name: value for name, value in config.items() if name != "number"}
     options = replace(at_point(training, point), out=training.out / f"{config['number']:03d}")
