@@ -63,6 +63,7 @@ def test_a_trial_that_is_killed_goes_on_and_tells_everything_again(begin):
     assert (begin.out / "checkpoints" / "step-00000003").exists()  # before the score was told
     told = begin()
     assert steps_of(told) == [3, STEPS] and told[0]["score"] == killed[0]["score"]
+    assert "seconds" not in told[0] and told[1]["seconds"] > killed[0]["seconds"] > 0
     assert trained(begin.out) == list(range(1, STEPS + 1))  # no step twice
     again = begin()
     assert [(r["step"], r["score"]) for r in again] == [(r["step"], r["score"]) for r in told]

@@ -3,7 +3,7 @@
     {"kind": "begin", "trial": 3, "point": {...}}         a process took it up, for the first time or again
     {"kind": "score", "trial": 3, "step": 178, "score": 41.2, ...}
     {"kind": "death", "trial": 3, "reason": "..."}                      its process died; it starts again
-    {"kind": "end", "trial": 3, "status": "stopped", "step": 534}
+    {"kind": "end", "trial": 3, "status": "stopped", "reason": ""}
 
 A line may come twice where a search was killed and went on; the later one counts. The last one may be torn.
 """

@@ -59,20 +59,20 @@ def run_trial(
         if not math.isfinite(_mean(scores["score"])):
             raise Diverged("the score is not finite")
         trainer.save()
-        _report(trainer.step, scores, trainer.seconds)
+        _report(trainer.step, scores, seconds=trainer.seconds)
 
     for line in _validations(options):
-        _report(line["step"], line, line.get("seconds", 0.0))
+        _report(line["step"], line)  # how long it took is not written there
     try:
         trainer.run(tell)
     except Diverged as error:
         tune.report({"step": trainer.step, "score": WORST_DB, "diverged": True, "reason": str(error)})
 
 
-def _report(step: int, scores: Scores, seconds: float) -> None:
+def _report(step: int, scores: Scores, **measured: float) -> None:
     told: dict[str, Any] = {name: _mean(scores[name]) for name in ("score", "psnr", "depth_psnr") if name in scores}
-    told |= {"step": step, "seconds": seconds, "diverged": False, "host": socket.gethostname(), "pid": os.getpid()}
-    tune.report(told)
+    told |= {"step": step, "diverged": False, "host": socket.gethostname(), "pid": os.getpid()}
+    tune.report(told | measured)
 
 
 def _validations(options: TrainOptions) -> list[dict[str, Any]]:
