@@ -107,7 +107,26 @@ def test_the_best_of_those_that_ran_to_the_end_is_what_train_worldmodel_takes(ou
     for axis in WEIGHTS:
         assert getattr(options.losses, axis.name) == point(2)[axis.name]
     text = (out / "report.md").read_text()
+    assert "Searched: learning rate 3e-05 to 0.001, rgb 0.001 to 1, depth" in text and ", power 1 or 2.\n" in text
     assert "trial 2, 40.00 dB, +3.00 dB against trial 0" in text and "| 3 and 9 | 0.900 | 0.083 | 5 |" in text
+
+
+def test_a_search_around_the_preset_says_so(out):
+    path = out / "tune.json"
+    settings = json.loads(path.read_text())
+    settings["options"]["around"], settings["axes"]["kl"] = 3.0, [0.1 / 3, 0.3]
+    path.write_text(json.dumps(settings))
+    report(out)
+    text = (out / "report.md").read_text()
+    assert "Searched within a factor of 3 of the preset's values: learning rate" in text
+    assert ", kl 0.033 to 0.3, power 1 or 2." in text
+
+
+@pytest.mark.parametrize(
+    ("value", "label"), [(1.5e-3, "1.5e-3"), (1e-3, "1e-3"), (1.67e-4, "1.7e-4"), (0.0333, "0.0333"), (1.0, "1")]
+)
+def test_the_ends_of_an_axis_are_not_rounded_away(value, label):
+    assert _Scale(np.array([value, 2.0]), True).label(value) == label
 
 
 def test_pictures(out):

@@ -106,7 +106,10 @@ class _Scale:
         return float((value - low) / (high - low)) if high > low else 0.5
 
     def label(self, value: float) -> str:
-        return f"{value:.0e}".replace("e-0", "e-") if self._logarithmic and value < 0.01 else f"{value:.3g}"
+        """Two or three digits, in little room."""
+        if self._logarithmic and value < 0.01:
+            return f"{value:.1e}".replace(".0e", "e").replace("e-0", "e-")
+        return f"{value:.3g}"
 
 
 def _title(name: str) -> str:

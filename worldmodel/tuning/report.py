@@ -69,6 +69,7 @@ def summarise(settings: Document, trials: list[Trial]) -> Document:
     return {
         "budgets": budgets,
         "axes": settings["axes"],
+        "around": settings["options"].get("around"),
         "asked": settings["options"]["trials"],
         "searcher": settings["options"]["searcher"],
         "trials": [
@@ -107,6 +108,8 @@ def markdown(document: Document) -> str:
             if any(trial["status"] == status for trial in trials)
         ),
         "",
+        f"{_searched(document)}.",
+        "",
     ]
     if document["best"] is not None:
         best = trials[document["best"]]
@@ -138,6 +141,13 @@ def markdown(document: Document) -> str:
                 [[" and ".join(map(str, pair["budgets"])), *_correlation(pair), str(pair["n"])] for pair in pairs],
             )
     return "\n".join(lines) + "\n"
+
+
+def _searched(document: Document) -> str:
+    """The ranges, and what they are about."""
+    of = "" if document["around"] is None else f" within a factor of {document['around']:g} of the preset's values"
+    ranges = [f"{name.replace('_', ' ')} {low:.2g} to {high:.2g}" for name, (low, high) in document["axes"].items()]
+    return f"Searched{of}: {', '.join(ranges)}, power 1 or 2"
 
 
 def _table(head: list[str], rows: list[list[str]]) -> list[str]:
