@@ -115,14 +115,21 @@ def existing_run(options: TrainOptions) -> TrainOptions | None:
             options = replace(options, precision=before["precision"])
     except (ValueError, TypeError, KeyError) as error:
         raise UsageError(f"{path} is damaged ({error}); restore it, or give another --out") from error
-    document = document_of(options)
-    for name in document:
-        if name not in HOW_NOT_WHAT and not _same(name, before.get(name), document[name]):
-            raise UsageError(
-                f"{options.out} holds a run with {_difference(name, before.get(name), document[name])}; give the same "
-                "options to go on with it, or another --out"
-            )
+    now = {name: value for name, value in document_of(options).items() if name not in HOW_NOT_WHAT}
+    change = first_change(before, now)
+    if change is not None:
+        raise UsageError(
+            f"{options.out} holds a run with {change}; give the same options to go on with it, or another --out"
+        )
     return options
+
+
+def first_change(before: dict[str, Any], now: dict[str, Any]) -> str | None:
+    """The first of the options `now` that was another `before`, with both values; None where there is none."""
+    for name, value in now.items():
+        if not _same(name, before.get(name), value):
+            return _difference(name, before.get(name), value)
+    return None
 
 
 def _difference(name: str, before: Any, now: Any) -> str:

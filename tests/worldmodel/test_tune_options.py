@@ -114,6 +114,17 @@ def test_the_folder_says_what_is_searched(tune_with):
     assert_one_line(tune_with(), "around = 3.0, not None")
 
 
+def test_a_dataset_may_go_by_several_names(tune_with, write_dataset, monkeypatch, tmp_path):
+    data, held_out = (write_dataset(tmp_path / name, [16, 16, 16], seed=seed) for seed, name in enumerate("dv"))
+    assert tune_with("--validation", held_out, data=data)[0] == 130
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "link").symlink_to(data)
+    assert tune_with("--validation", "v", data="d")[0] == 130
+    assert tune_with("--validation", "./v", data="link")[0] == 130
+    assert_one_line(tune_with("--validation", "d", data="d"), f"validation = {held_out}, not {data}")
+    assert_one_line(tune_with(data="d"), f"validation = {held_out}, not None")
+
+
 def test_a_search_from_before_there_was_around_goes_on_without(tune_with):
     assert tune_with()[0] == 130
     path = tune_with.out / "tune.json"
@@ -242,6 +253,8 @@ def test_a_folder_holds_one_search(tune_with, tmp_path):
     config = tmp_path / "gap.json"
     config.write_text('{"frame_gap": 2}')
     assert_one_line(tune_with("--trials", 2, "--config", config), "frame_gap = 3, not 2")
+    config.write_text('{"losses": {"kl": 0.5}}')
+    assert_one_line(tune_with("--trials", 2, "--config", config), "holds a search with losses.kl = 0.1, not 0.5;")
     (tune_with.out / "tune.json").write_text("{")
     assert_one_line(tune_with("--trials", 2), "tune.json", "is damaged")
     other = tmp_path / "other"

@@ -17,6 +17,8 @@ from worldmodel.train import parse_options
 SearcherName = Literal["random", "bohb", "hebo"]
 PLACEMENT = ("out", "workers", "retries", "ray")
 """Options that say where trials run, not what comes out: they may change when a search goes on."""
+TRAINING = ("data", "validation", "config")
+"""Options that are in `training`, where a folder has one name, however it was given."""
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,5 @@ class TuneOptions:
         return values | {"preset": self.training.preset, "model": self.training.model}
 
     def document(self) -> dict[str, Any]:
-        """What must be the same when a search goes on, as JSON has it."""
-        names = [name for name in self.__dataclass_fields__ if name not in (*PLACEMENT, "config")]
-        return {name: str(v) if isinstance(v := getattr(self, name), Path) else v for name in names}
+        """What must be the same when a search goes on, beside `training`."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in (*PLACEMENT, *TRAINING)}

@@ -12,7 +12,7 @@ from data_collection.files import write_json
 from data_collection.ray_cluster import connect
 from envs.errors import UsageError
 from worldmodel.clips import ClipSource
-from worldmodel.train import document_of
+from worldmodel.train import document_of, first_change
 from worldmodel.training_data import open_data, settled
 from worldmodel.tuning import journal
 from worldmodel.tuning.options import TuneOptions
@@ -55,18 +55,13 @@ def settle(options: TuneOptions) -> Data:
         return data
     try:
         before = json.loads(path.read_text())
-        changes = [
-            (name, before[group].get(name), value)
-            for group in ("options", "training", "data")
-            for name, value in document[group].items()
-            if before[group].get(name) != value
-        ]
+        groups = ("options", "training", "data")
+        changes = [change for group in groups if (change := first_change(before[group], document[group]))]
     except (ValueError, KeyError, AttributeError) as error:
         raise UsageError(f"{path} is damaged ({error}); restore it, or give another --out") from error
-    for name, old, new in changes:
+    if changes:
         raise UsageError(
-            f"{options.out} holds a search with {name} = {old}, not {new}; give the same options to go on with it, or "
-            "another --out"
+            f"{options.out} holds a search with {changes[0]}; give the same options to go on with it, or another --out"
         )
     return data
 
