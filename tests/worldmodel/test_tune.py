@@ -19,7 +19,7 @@ from worldmodel.tuning import journal
 from worldmodel.tuning.options import TuneOptions
 
 TRIALS, STEPS = 4, 12
-LINE = ["--preset", "tiny", "--trials", TRIALS, "--steps", STEPS, "--rungs", 1, "--unpruned", 2, "--workers", 1]
+LINE = ["--preset", "tiny", "--steps", STEPS, "--rungs", 1, "--unpruned", 2, "--around", 3, "--workers", 1]
 
 
 @pytest.fixture
@@ -27,8 +27,9 @@ def start(tiny_dataset, tmp_path):
     """Starts the command in a process of its own."""
     begun = []
 
-    def begin():
-        line = [sys.executable, "-m", "worldmodel.tune", "--data", tiny_dataset, "--out", tmp_path / "tuned", *LINE]
+    def begin(trials=TRIALS):
+        line = [sys.executable, "-m", "worldmodel.tune", "--data", tiny_dataset, "--out", tmp_path / "tuned"]
+        line += [*LINE, "--trials", trials]
         with (tmp_path / "log.txt").open("ab") as log:
             environment = os.environ | {"TORCHDYNAMO_DISABLE": "1"}
             begun.append(subprocess.Popen(list(map(str, line)), stdout=log, stderr=log, env=environment))
@@ -80,6 +81,10 @@ def test_a_worker_and_then_the_search_are_killed_and_the_same_command_goes_on(st
     for trial in trials[:2]:  # the unpruned ones
         assert trial.status == "finished" and set(trial.scores) == {4, 8, 12}
     assert trials[0].deaths == 1
+    for name, (low, high) in json.loads((out / "tune.json").read_text())["axes"].items():
+        own = trials[0].point[name]
+        assert (low, high) == pytest.approx((own / 3, own * 3)) and own not in [t.point[name] for t in trials[1:]]
+        assert all(low <= trial.point[name] <= high for trial in trials)
 
     steps = [line["step"] for line in validated(out) if line["kind"] == "train"]
     assert set(steps) == set(range(1, STEPS + 1))
@@ -107,6 +112,15 @@ def test_a_worker_and_then_the_search_are_killed_and_the_same_command_goes_on(st
     assert trained["losses"]["knn"] == best.point["knn"] and trained["losses"]["power"] == best.point["power"]
 
     before = results.read_bytes()
-    line = ["--data", tiny_dataset, "--out", out, *LINE]
+    line = ["--data", tiny_dataset, "--out", out, *LINE, "--trials", TRIALS]
     run(TuneOptions, tune.main, list(map(str, line)))  # there is nothing left to do, and no Ray to be started
     assert results.read_bytes() == before and not ray.is_initialized()
+
+    saved = {path: path.stat().st_mtime_ns for path in out.glob("trials/*/checkpoints/*/*.safetensors")}
+    process = start(trials=TRIALS + 1)
+    assert process.wait() == 0, (tmp_path / "log.txt").read_text()[-3000:]
+    *first, new = journal.trials(results)
+    assert first == trials and new.number == TRIALS and new.status in ("finished", "stopped")
+    assert len({trial.point["rgb"] for trial in (*first, new)}) == TRIALS + 1
+    assert saved and {path: path.stat().st_mtime_ns for path in saved} == saved  # none of theirs was trained again
+    assert f"of {TRIALS + 1} trials begun" in (out / "report.md").read_text()

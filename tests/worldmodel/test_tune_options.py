@@ -12,7 +12,7 @@ from envs.command import run
 from worldmodel import tune
 from worldmodel.options import PRESETS
 from worldmodel.trainer import Trainer
-from worldmodel.tuning import journal
+from worldmodel.tuning import journal, searchers
 from worldmodel.tuning.halving import Halving
 from worldmodel.tuning.options import TuneOptions
 from worldmodel.tuning.searchers import make_searcher, ray_space
@@ -112,6 +112,25 @@ def test_the_folder_says_what_is_searched(tune_with):
     assert axes["kl"] == pytest.approx([TINY.losses.kl / 3, TINY.losses.kl * 3])
     assert_one_line(tune_with("--around", 2), "around = 3.0, not 2.0", "another --out")
     assert_one_line(tune_with(), "around = 3.0, not None")
+
+
+def test_a_search_may_be_given_more_trials_where_they_hang_on_their_number_alone(tune_with, monkeypatch):
+    def settings():
+        return json.loads((tune_with.out / "tune.json").read_text())
+
+    assert tune_with("--trials", 2)[0] == 130
+    (tune_with.out / "ray").mkdir()
+    assert tune_with("--trials", 2)[0] == 130 and (tune_with.out / "ray").exists()
+    assert_one_line(tune_with("--trials", 3, "--steps", 18), "steps = None, not 18")
+    assert settings()["options"]["trials"] == 2 and (tune_with.out / "ray").exists()
+    assert tune_with("--trials", 3)[0] == 130
+    assert settings()["options"]["trials"] == 3 and not (tune_with.out / "ray").exists()  # Ray knows of two
+    other = settings()
+    (tune_with.out / "tune.json").write_text(json.dumps(other | {"axes": {"rgb": [0.1, 1.0]}}))
+    assert_one_line(tune_with("--trials", 4), "trials = 3, not 4")
+    monkeypatch.setattr(searchers, "check_searcher", lambda name: None)
+    (tune_with.out / "tune.json").write_text(json.dumps(other | {"options": other["options"] | {"searcher": "bohb"}}))
+    assert_one_line(tune_with("--trials", 4, "--searcher", "bohb"), "trials = 3, not 4", "another --out")
 
 
 def test_a_dataset_may_go_by_several_names(tune_with, write_dataset, monkeypatch, tmp_path):
@@ -248,7 +267,7 @@ def test_data_that_does_not_do(tune_with, write_dataset, tmp_path):
 def test_a_folder_holds_one_search(tune_with, tmp_path):
     assert tune_with("--trials", 2)[0] == 130  # begun, and not finished
     assert tune_with("--trials", 2, "--workers", 3, "--retries", 1)[0] == 130
-    assert_one_line(tune_with("--trials", 3), str(tune_with.out), "trials = 2, not 3", "another --out")
+    assert_one_line(tune_with("--trials", 1), str(tune_with.out), "trials = 2, not 1", "another --out")
     assert_one_line(tune_with("--trials", 2, "--steps", 18), "steps = None, not 18")
     config = tmp_path / "gap.json"
     config.write_text('{"frame_gap": 2}')

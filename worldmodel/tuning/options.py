@@ -37,7 +37,7 @@ class TuneOptions:
     preset: Literal["tiny", "cpu", "paper"] | None = None
     """Preset of train-worldmodel that all trials start from; by default the config file's, or cpu."""
     trials: int = 30
-    """Configurations to try."""
+    """Configurations to try. A search goes on with the same number or, where the searcher is random, with more."""
     validation: Path | None = None
     """Dataset to validate on; by default the last tenth of the training episodes is held out."""
     model: ModelName | None = None

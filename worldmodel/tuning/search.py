@@ -33,6 +33,8 @@ Data = tuple[ClipSource, ValidationSet]
 def settle(options: TuneOptions) -> Data:
     """Open the data, and write down what is searched, or see that it is what the folder's search was begun with.
 
+    Where a configuration hangs on its number alone, more trials may be asked for than at the beginning.
+
     Raises:
         UsageError: the data does not do, or the folder holds another search.
     """
@@ -55,14 +57,21 @@ def settle(options: TuneOptions) -> Data:
         return data
     try:
         before = json.loads(path.read_text())
+        more = options.trials > before["options"]["trials"] and options.searcher == "random"
+        if more and before["axes"] == document["axes"]:  # else the first ones would be drawn anew
+            before["options"]["trials"] = options.trials
         groups = ("options", "training", "data")
         changes = [change for group in groups if (change := first_change(before[group], document[group]))]
-    except (ValueError, KeyError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UsageError(f"{path} is damaged ({error}); restore it, or give another --out") from error
     if changes:
         raise UsageError(
             f"{options.out} holds a search with {changes[0]}; give the same options to go on with it, or another --out"
         )
+    if more:
+        if (options.out / RAY).exists():
+            shutil.rmtree(options.out / RAY)  # it knows of fewer; trials go on from their own folders
+        write_json(path, document)
     return data
 
 
