@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 logger = logging.getLogger(__name__)
@@ -37,12 +38,18 @@ def can_compile(device: str = "cpu") -> bool:
     else:
         missing = f"backend for {device}"
     if missing:
-        logger.info("no %s found: running without torch.compile, which is slower; results are the same", missing)
+        _warn("no %s found: running without torch.compile, which is slower; results are the same", missing)
     return not missing
 
 
 def _found(variable: str, *names: str) -> bool:
     return any(shutil.which(name) for name in (os.environ.get(variable, ""), *names) if name)
+
+
+def _warn(message: str, *values: str) -> None:
+    """Log on a line of its own: training has begun, and its progress bar would run into the message and hide it."""
+    with tqdm.external_write_mode():
+        logger.warning(message, *values)
 
 
 def compiled(function: Function) -> Function:
@@ -71,7 +78,7 @@ def compiled(function: Function) -> Function:
                 raise
             failed = True
             reason = str(error).strip().splitlines()[0]
-            logger.warning("%s runs without torch.compile, which failed (%s)", function.__name__, reason)
+            _warn("%s runs without torch.compile, which failed (%s)", function.__name__, reason)
             return function(*args, **kwargs)
 
     return call  # type: ignore[return-value]

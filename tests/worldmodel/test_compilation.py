@@ -1,10 +1,12 @@
 """Without a compiler, or with one that fails, everything runs as it is."""
 
 import logging
+import sys
 
 import pytest
 import torch
 from torch._dynamo.exc import BackendCompilerFailed
+from tqdm import tqdm
 
 from worldmodel import compilation
 from worldmodel.compilation import can_compile, compiled
@@ -31,13 +33,25 @@ def double(x):
     return 2 * x
 
 
-def test_without_a_compiler_it_is_the_plain_function(monkeypatch):
+def test_without_a_compiler_it_is_the_plain_function(monkeypatch, caplog):
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CXX", raising=False)
     monkeypatch.setattr(torch, "compile", lambda *args, **kwargs: pytest.fail("there is nothing to compile with"))
-    assert not can_compile() and not can_compile("cuda") and not can_compile("mps")
+    assert not can_compile("cpu") and not can_compile("cuda") and not can_compile("mps")
     function = compiled(double)
     assert function.__doc__ == "Doubles." and function(torch.ones(2)).tolist() == [2, 2]
+    missing = [record.getMessage().split(":")[0] for record in caplog.records if record.levelno == logging.WARNING]
+    assert len(missing) == 3 and missing[::2] == ["no C++ compiler found", "no backend for mps found"]  # each once
+
+
+def test_what_is_missing_has_a_line_beside_a_progress_bar(monkeypatch, capsys):
+    handler = logging.StreamHandler(sys.stderr)
+    monkeypatch.setattr(compilation.logger, "handlers", [handler])
+    with tqdm(total=2, file=sys.stderr) as bar:
+        bar.update()
+        can_compile("mps")
+    said = capsys.readouterr().err.replace("\r", "\n").splitlines()
+    assert any(line.startswith("no backend for mps found") and line.endswith("the same") for line in said), said
 
 
 def test_a_compiler_that_fails_is_named_once_and_not_asked_again(monkeypatch, caplog):
