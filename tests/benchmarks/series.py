@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import torch
+
 from tests.benchmarks.child import measure
 from tests.benchmarks.result import Result, cost
+from worldmodel.devices import best_precision
 from worldmodel.options import PRESETS
 
 Point = dict[str, Any]
@@ -52,7 +55,9 @@ def _base(preset: str) -> Point:
         "batch": options.batch,
         "width": options.architecture.width,
         "frames": frames,
-        "precision": options.precision,
+        "precision": str(best_precision(torch.device("cpu"))).removeprefix("torch.")
+        if options.precision == "auto"
+        else options.precision,
     }
 
 

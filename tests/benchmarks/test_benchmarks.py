@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.benchmarks import plain
+from tests.benchmarks import plain, series
 from tests.benchmarks.subjects import scaling
 from tests.benchmarks.subjects.losses import clouds
 from tests.benchmarks.subjects.training import make_trainer
@@ -45,6 +45,13 @@ def test_quick_run_writes_results_and_machine(tmp_path):
     assert result["value"] > 0 and result["ratio"] > 0 and "splat" in ran.stdout
     machine = json.loads((tmp_path / "new" / "bench-machine.json").read_text())
     assert machine["cores"] >= 1 and machine["quick"] and machine["versions"]["torch"]
+
+
+def test_every_point_of_the_series_has_a_precision_whose_speed_is_measured():
+    for preset in ("tiny", "cpu", "paper"):
+        points = series._points(preset, quick=False).values()
+        assert {point["precision"] for point in points} == set(series.SIZES["precision"])
+        assert set(series.SIZES["precision"]) < scaling.peaks(size=16, megabytes=1, repeats=1).keys()
 
 
 def test_what_a_step_must_take_at_least():

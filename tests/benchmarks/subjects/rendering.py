@@ -91,7 +91,15 @@ def robosuite_steps(steps: int, repeats: int) -> float:
     observation = env.reset()
     assert observation["agentview_image"].shape == (SIZE, SIZE, 3)
     assert observation["agentview_depth"].shape[:2] == (SIZE, SIZE)
-    return _steps_a_second(env.step, env.action_dim, steps, repeats)
+    pictures = set()
+
+    def step(action: np.ndarray) -> None:
+        pictures.add(env.step(action)[0]["agentview_image"].tobytes())
+
+    speed = _steps_a_second(step, env.action_dim, steps, repeats)
+    if len(pictures) < 0.8 * steps * (repeats + 1):
+        raise RuntimeError(f"robosuite drew {len(pictures)} different pictures in {steps * (repeats + 1)} steps")
+    return speed
 
 
 def tabletop_frames(frames: int, repeats: int) -> float:
