@@ -2,7 +2,6 @@
 
 import os
 import signal
-import socket
 from pathlib import Path
 from unittest import mock
 
@@ -17,6 +16,7 @@ from data_collection.ray_cluster import QUIET, connect
 from data_collection.ray_workers import Collector, RayPool
 from data_collection.repair import find_damage
 from data_collection.workers import Collected, WorkerLost, collect_episodes
+from tests.ray_nodes import started_nodes
 
 ROOT = HERE.parent.parent
 STEP_S = 0.1
@@ -37,26 +37,6 @@ def cluster(tmp_path_factory):
         nodes = started_nodes()
     yield nodes
     nodes.shutdown()
-
-
-def started_nodes():
-    from ray.cluster_utils import Cluster
-
-    nodes = Cluster()
-    nodes.add_node(num_cpus=1, include_dashboard=False, **agents())
-    nodes.add_node(num_cpus=1, **agents())
-    return nodes
-
-
-def agents():
-    """Ports of a node's helpers. Where they choose some themselves, Ray waits for them no longer than 30 s, which is
-    too short for a busy machine."""
-    names = ("metrics_agent_port", "metrics_export_port", "dashboard_agent_listen_port", "runtime_env_agent_port")
-    sockets = [socket.create_server(("", 0)) for _ in names]
-    ports = {name: taken.getsockname()[1] for name, taken in zip(names, sockets, strict=True)}
-    for taken in sockets:
-        taken.close()
-    return ports
 
 
 def shards(folder):

@@ -1,7 +1,6 @@
 """`tune-worldmodel --ray`: trials on two machines, one of which dies; its trial goes on at the other."""
 
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -11,36 +10,20 @@ import psutil
 import pytest
 
 from data_collection.ray_cluster import QUIET
+from tests.ray_nodes import started_nodes
 from worldmodel.tuning import journal
 
 TRIALS, STEPS = 3, 60
 LINE = ["--preset", "tiny", "--trials", TRIALS, "--steps", STEPS, "--unpruned", TRIALS]
-AGENTS = ("metrics_agent_port", "metrics_export_port", "dashboard_agent_listen_port", "runtime_env_agent_port")
-"""A node's helpers. Where they choose ports themselves, Ray waits for them no longer than 30 s, which is too short for
-a busy machine."""
 
 
 @pytest.fixture
 def cluster():
     """Two nodes with a CPU each."""
     with mock.patch.dict(os.environ, QUIET | {"TORCHDYNAMO_DISABLE": "1"}):
-        from ray.cluster_utils import Cluster
-
-        nodes = Cluster()
-        try:
-            nodes.add_node(num_cpus=1, include_dashboard=False, **free_ports("gcs_server_port", *AGENTS))
-            nodes.add_node(num_cpus=1, **free_ports(*AGENTS))
-            yield nodes
-        finally:
-            nodes.shutdown()
-
-
-def free_ports(*names):
-    sockets = [socket.create_server(("", 0)) for _ in names]
-    ports = {name: taken.getsockname()[1] for name, taken in zip(names, sockets, strict=True)}
-    for taken in sockets:
-        taken.close()
-    return ports
+        nodes = started_nodes()
+        yield nodes
+        nodes.shutdown()
 
 
 @pytest.fixture

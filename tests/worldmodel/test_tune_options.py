@@ -128,6 +128,7 @@ def test_a_search_may_be_given_more_trials_where_they_hang_on_their_number_alone
     other = settings()
     (tune_with.out / "tune.json").write_text(json.dumps(other | {"axes": {"rgb": [0.1, 1.0]}}))
     assert_one_line(tune_with("--trials", 4), "trials = 3, not 4")
+    assert_one_line(tune_with("--trials", 3), "ranges {'rgb': [0.1, 1.0]}, not {", "another --out")
     monkeypatch.setattr(searchers, "check_searcher", lambda name: None)
     (tune_with.out / "tune.json").write_text(json.dumps(other | {"options": other["options"] | {"searcher": "bohb"}}))
     assert_one_line(tune_with("--trials", 4, "--searcher", "bohb"), "trials = 3, not 4", "another --out")

@@ -58,10 +58,13 @@ def settle(options: TuneOptions) -> Data:
     try:
         before = json.loads(path.read_text())
         more = options.trials > before["options"]["trials"] and options.searcher == "random"
-        if more and before["axes"] == document["axes"]:  # else the first ones would be drawn anew
+        same_ranges = before["axes"] == document["axes"]
+        if more and same_ranges:
             before["options"]["trials"] = options.trials
         groups = ("options", "training", "data")
         changes = [change for group in groups if (change := first_change(before[group], document[group]))]
+        if not same_ranges:  # those of an older version: configurations would be drawn anew
+            changes.append(f"ranges {before['axes']}, not {document['axes']}")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UsageError(f"{path} is damaged ({error}); restore it, or give another --out") from error
     if changes:

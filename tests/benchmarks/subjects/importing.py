@@ -24,8 +24,8 @@ def import_speed(frames: int, size: int) -> dict[str, float]:
     """Import and unpack every file in turn.
 
     Returns:
-        "gigabytes" of the files, and the "gigabytes_a_second" of them that the import takes in, and that reading and
-        unpacking the same arrays alone does.
+        "gigabytes" of the files, and how many of them a second the "import" takes in, and to "unpack" the same arrays
+        alone.
     """
     with _recording(frames, size) as (folder, out):
         files = sorted(folder.glob("episode_*.npz"))
