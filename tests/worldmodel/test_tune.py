@@ -74,6 +74,7 @@ def test_a_worker_and_then_the_search_are_killed_and_the_same_command_goes_on(st
     assert {trial.status for trial in trials} <= {"finished", "stopped"}
     for trial in trials[:2]:  # the unpruned ones
         assert trial.status == "finished" and set(trial.scores) == {4, 8, 12}
+        assert all(parts["flow_error_moving"] > 0 for parts in trial.parts.values()) and len(trial.parts) == 3
     assert trials[0].deaths == 1
     for name, (low, high) in json.loads((out / "tune.json").read_text())["axes"].items():
         own = trials[0].point[name]

@@ -67,6 +67,11 @@ def report(out):
     return json.loads((out / "report.json").read_text())
 
 
+def markdown_of(out):
+    report(out)
+    return (out / "report.md").read_text()
+
+
 def test_rank_correlations_are_spearmans_with_counts(out):
     document = report(out)
     unpruned = {tuple(pair["budgets"]): pair for pair in document["rank_correlation"]["unpruned"]}
@@ -120,6 +125,21 @@ def test_a_search_around_the_preset_says_so(out):
     text = (out / "report.md").read_text()
     assert "Searched within a factor of 3 of the preset's values: learning rate" in text
     assert ", kl 0.033 to 0.3, power 1 or 2." in text
+
+
+def test_the_motion_that_no_score_sees_is_told(out):
+    assert "flow" not in markdown_of(out)  # nobody has measured it
+    results = out / journal.JOURNAL
+    for number, flow in ((0, 0.2), (2, 0.3)):
+        line = {"kind": "score", "trial": number, "step": 27, "score": SCORES[number][2], "psnr": 20.0 + number}
+        journal.append(results, line | {"flow_error_moving": flow})
+    text = markdown_of(out)
+    assert "Its scene-flow error on what moves is 0.30 (trial 0: 0.20), which no score counts: plan with it" in text
+    assert "| trial | status | at 3 | at 9 | at 27 | RGB, dB | flow error | learning rate |" in text
+    (row,) = (line for line in text.splitlines() if line.startswith("| 2* |"))
+    assert "| 40.00 | 22.00 | 0.30 |" in row
+    journal.append(results, {"kind": "score", "trial": 2, "step": 27, "score": 40.0, "flow_error_moving": 0.21})
+    assert "(trial 0: 0.20), which no score counts.\n" in markdown_of(out)
 
 
 @pytest.mark.parametrize(

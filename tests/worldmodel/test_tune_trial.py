@@ -60,6 +60,7 @@ def test_a_trial_that_is_killed_goes_on_and_tells_everything_again(begin):
     killed = begin(kill_at=3)
     assert steps_of(killed) == [3] and not killed[0]["diverged"]
     assert killed[0]["score"] == pytest.approx(killed[0]["psnr"] + killed[0]["depth_psnr"])
+    assert killed[0]["flow_error_moving"] > 0
     assert (begin.out / "checkpoints" / "step-00000003").exists()  # before the score was told
     told = begin()
     assert steps_of(told) == [3, STEPS] and told[0]["score"] == killed[0]["score"]

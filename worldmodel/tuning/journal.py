@@ -17,6 +17,8 @@ from typing import Any, Literal
 
 Status = Literal["running", "finished", "stopped", "diverged", "failed"]
 JOURNAL = "results.jsonl"
+PARTS = ("psnr", "depth_psnr", "flow_error_moving")
+"""Told with a score: the two that it is the sum of, dB, and with ground truth the motion that it does not see."""
 
 
 @dataclass
@@ -28,6 +30,8 @@ class Trial:
     point: dict[str, float] = field(default_factory=dict)
     scores: dict[int, float] = field(default_factory=dict)
     """Step -> score, dB."""
+    parts: dict[int, dict[str, float]] = field(default_factory=dict)
+    """Step -> those of `PARTS` that are known."""
     status: Status = "running"
     """`stopped` at a rung; `diverged`: its losses or scores were no numbers; `failed`: died too often."""
     deaths: int = 0
@@ -80,7 +84,9 @@ def trials(path: Path) -> list[Trial]:
                 trial = known[trial.number] = Trial(trial.number, line["point"])
             trial.status = "running"
         elif kind == "score":
-            trial.scores[int(line["step"])] = float(line["score"])
+            step = int(line["step"])
+            trial.scores[step] = float(line["score"])
+            trial.parts[step] = {name: float(line[name]) for name in PARTS if name in line}
         elif kind == "death":
             trial.deaths += 1
         elif kind == "end":

@@ -11,13 +11,16 @@ from envs.errors import UsageError
 from worldmodel.tuning import journal
 from worldmodel.tuning.correlation import FEWEST, rank_correlations, written
 from worldmodel.tuning.figures import draw_correlations, draw_trials
-from worldmodel.tuning.journal import Trial
+from worldmodel.tuning.journal import PARTS, Trial
 from worldmodel.tuning.search import SETTINGS
 from worldmodel.tuning.space import as_options
 
 FILES = ("report.json", "report.md", "trials.png", "rank-correlation.png", "best.json")
 
 Document = dict[str, Any]
+_PARTS = dict(zip(PARTS, ("RGB, dB", "depth, dB", "flow error"), strict=True))
+WORSE = 1.2
+"""A flow error so many times that of the preset is pointed out."""
 
 
 def write_report(out: Path) -> Document:
@@ -83,6 +86,7 @@ def summarise(settings: Document, trials: list[Trial]) -> Document:
                 "unpruned": trial.number < spared,
                 "point": trial.point,
                 "scores": {str(step): trial.scores[step] for step in sorted(trial.scores)},
+                "parts": {str(step): trial.parts[step] for step in sorted(trial.parts)},
             }
             for trial in trials
         ],
@@ -100,6 +104,7 @@ def markdown(document: Document) -> str:
     """The report for people."""
     budgets, trials = document["budgets"], document["trials"]
     names = [*document["axes"], "power"]
+    parts = [part for part in _PARTS if any(part in _last(trial) for trial in trials)]
     lines = [
         f"{len(trials)} of {document['asked']} trials begun ({document['searcher']}): "
         + ", ".join(
@@ -119,19 +124,28 @@ def markdown(document: Document) -> str:
         elif document["gain"] is not None:
             line += f", {document['gain']:+.2f} dB against trial 0, which has the preset's values"
         lines += [f"{line}.", ""]
+        if best["number"] != 0 and document["gain"] is not None:
+            lines += _motion(best, trials[0], str(budgets[-1]))
     lines += _table(
-        ["trial", "status", *(f"at {budget}" for budget in budgets), *(name.replace("_", " ") for name in names)],
+        [
+            *("trial", "status", *(f"at {budget}" for budget in budgets)),
+            *(_PARTS[part] for part in parts),
+            *(name.replace("_", " ") for name in names),
+        ],
         [
             [
                 f"{t['number']}{'*' if t['unpruned'] else ''}",
                 t["status"],
                 *(_decibels(t["scores"].get(str(budget))) for budget in budgets),
+                *(_decibels(_last(t).get(part)) for part in parts),
                 *(f"{t['point'][name]:.3g}" if name in t["point"] else "" for name in names),
             ]
             for t in sorted(trials, key=lambda t: (-t["step"], -(t["score"] or 0)))
         ],
     )
     lines += ["", "Scores in dB, after so many steps. * runs to the end whatever its scores."]
+    if parts:
+        lines[-1] += " RGB, depth and flow are those of a trial's last score."
     for of, which in (("all", "all trials"), ("unpruned", "the unpruned trials")):
         pairs = document["rank_correlation"][of]
         if any(pair["r"] is not None for pair in pairs):
@@ -141,6 +155,21 @@ def markdown(document: Document) -> str:
                 [[" and ".join(map(str, pair["budgets"])), *_correlation(pair), str(pair["n"])] for pair in pairs],
             )
     return "\n".join(lines) + "\n"
+
+
+def _motion(best: Document, default: Document, budget: str) -> list[str]:
+    """What the score does not see: a model may gain in PSNR and lose the motion that a planner goes by."""
+    ours, theirs = (trial["parts"].get(budget, {}).get("flow_error_moving") for trial in (best, default))
+    if ours is None or theirs is None:
+        return []
+    line = f"Its scene-flow error on what moves is {ours:.2f} (trial 0: {theirs:.2f}), which no score counts"
+    return [f"{line}{': plan with it before you believe it' if ours > WORSE * theirs else ''}.", ""]
+
+
+def _last(trial: Document) -> dict[str, float]:
+    """The parts of a trial's last score."""
+    parts: dict[str, dict[str, float]] = trial["parts"]
+    return parts.get(str(trial["step"]), {})
 
 
 def _searched(document: Document) -> str:

@@ -22,6 +22,7 @@ from worldmodel.options import TrainOptions
 from worldmodel.ranks import Ranks
 from worldmodel.train import claim, existing_run, make_trainer
 from worldmodel.trainer import Diverged
+from worldmodel.tuning.journal import PARTS
 from worldmodel.tuning.space import at_point
 from worldmodel.validation import Scores, ValidationSet
 
@@ -70,7 +71,7 @@ def run_trial(
 
 
 def _report(step: int, scores: Scores, **measured: float) -> None:
-    told: dict[str, Any] = {name: _mean(scores[name]) for name in ("score", "psnr", "depth_psnr") if name in scores}
+    told: dict[str, Any] = {name: _mean(scores[name]) for name in ("score", *PARTS) if name in scores}
     told |= {"step": step, "diverged": False, "host": socket.gethostname(), "pid": os.getpid()}
     tune.report(told | measured)
 

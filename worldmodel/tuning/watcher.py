@@ -53,7 +53,7 @@ class Watcher(Callback):
         """A validation, or the news that the trial diverged."""
         if result["diverged"]:
             return
-        told = ("step", "score", "psnr", "depth_psnr", "seconds", "host", "pid")
+        told = ("step", "score", *journal.PARTS, "seconds", "host", "pid")
         line = {name: result[name] for name in told if name in result}
         journal.append(self._results, {"kind": "score", "trial": _number(trial), **line})
         self._see(_number(trial), result["step"], result["score"])
