@@ -116,28 +116,30 @@ def existing_run(options: TrainOptions) -> TrainOptions | None:
     except (ValueError, TypeError, KeyError) as error:
         raise UsageError(f"{path} is damaged ({error}); restore it, or give another --out") from error
     now = {name: value for name, value in document_of(options).items() if name not in HOW_NOT_WHAT}
-    change = first_change(before, now)
-    if change is not None:
+    if found := changes(before, now):
         raise UsageError(
-            f"{options.out} holds a run with {change}; give the same options to go on with it, or another --out"
+            f"{options.out} holds a run with {'; '.join(found)}; give the same options to go on with it, or another "
+            "--out"
         )
     return options
 
 
-def first_change(before: dict[str, Any], now: dict[str, Any]) -> str | None:
-    """The first of the options `now` that was another `before`, with both values; None where there is none."""
-    for name, value in now.items():
-        if not _same(name, before.get(name), value):
-            return _difference(name, before.get(name), value)
-    return None
+def changes(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """The options `now` that were others `before`, each with both values."""
+    return [
+        change
+        for name, value in now.items()
+        if not _same(name, before.get(name), value)
+        for change in _differences(name, before.get(name), value)
+    ]
 
 
-def _difference(name: str, before: Any, now: Any) -> str:
-    """An option's two values; of a group of options, those of the first that differs."""
+def _differences(name: str, before: Any, now: Any) -> list[str]:
+    """An option's two values; of a group of options, those of all that differ."""
     if isinstance(before, dict) and isinstance(now, dict):
-        key = next(key for key in {**now, **before} if before.get(key) != now.get(key))
-        return _difference(f"{name}.{key}", before.get(key), now.get(key))
-    return f"{name} = {before}, not {now}"
+        keys = [key for key in {**now, **before} if before.get(key) != now.get(key)]
+        return [change for key in keys for change in _differences(f"{name}.{key}", before.get(key), now.get(key))]
+    return [f"{name} = {before}, not {now}"]
 
 
 def _same(name: str, before: Any, now: Any) -> bool:

@@ -114,13 +114,21 @@ def load_model(path: Path, device: str = "cpu", **changes: Any) -> Any:
     """
     try:
         with zipfile.ZipFile(path) as file:
-            module = json.loads(file.read("data"))["policy_class"]["__module__"]
-        package, algorithm = ALGORITHMS[module]
+            policy = json.loads(file.read("data"))["policy_class"]
+        if policy["__module__"] not in ALGORITHMS:
+            raise ValueError(f"its policy is of the class {policy.get('__name__')} of {policy['__module__']}")
+        package, algorithm = ALGORITHMS[policy["__module__"]]
         loader = getattr(importlib.import_module(package), algorithm)
         return loader.load(path, device=device, **(changes or {"custom_objects": NOT_NEEDED}))
     except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError, ImportError, AttributeError) as error:
         known = ", ".join(name for _, name in ALGORITHMS.values())
-        raise UsageError(f"{path} is no policy that can be loaded here ({error!r}); give a zip of {known}") from error
+        raise UsageError(
+            f"{path} is no policy that can be loaded here ({_said(error)}); give a zip of {known}"
+        ) from error
+
+
+def _said(error: Exception) -> str:
+    return str(error) if type(error) is ValueError else repr(error)
 
 
 def _digest(path: Path) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shlex
+import zipfile
 from types import SimpleNamespace
 
 import gymnasium
@@ -224,6 +225,16 @@ def test_training_goes_on_where_it_stopped(trained, tmp_path):
     assert load_model(path).num_timesteps == 112
     with pytest.raises(UsageError, match="is not the policy it was"):
         make_policy(policy_name(trained).replace(str(trained), str(path)))
+
+
+def test_a_policy_of_an_unknown_class_is_named(tmp_path):
+    path = tmp_path / "own.zip"
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("data", json.dumps({"policy_class": {"__module__": "__main__", "__name__": "MyPolicy"}}))
+    with pytest.raises(
+        UsageError, match=r"\(its policy is of the class MyPolicy of __main__\); give a zip of SAC, TD3"
+    ):
+        load_model(path)
 
 
 def test_a_trained_policy_says_how_to_collect_with_it(tmp_path):

@@ -165,8 +165,11 @@ def test_data_that_does_not_do(train, write_dataset, camera_of, tmp_path):
     test_scene = write_dataset(tmp_path / "d", [12, 12], env_id="t3vip/TabletopD-v0")
     assert_one_line(train(data=test_scene), "TabletopD-v0", "test scene")
     assert_one_line(train("--validation", test_scene), "TabletopD-v0", "test scene")
-    test_objects = write_dataset(tmp_path / "objects", [12, 12], env_kwargs={"split": "test"})
-    assert_one_line(train(data=test_objects), str(test_objects), "for testing only")
+    for env, split in (("some/Imported-v0", "test"), ("t3vip/PlanarPush-v0", "test"), ("t3vip/PlanarPush-v0", "all")):
+        test_objects = write_dataset(tmp_path / f"{env}-{split}", [12, 12], env_id=env, env_kwargs={"split": split})
+        assert_one_line(train(data=test_objects), str(test_objects), "for testing only")
+    folder = write_dataset(tmp_path / "all", [30], env_id="some/Imported-v0", env_kwargs={"split": "all"})
+    assert_one_line(train(data=folder), "1 episode")  # of a split in a folder that happens to have this name
     one = {"split": "train", "object": SPLITS["test"][0]}
     test_object = write_dataset(tmp_path / "object", [12, 12], env_id="t3vip/PlanarPush-v0", env_kwargs=one)
     assert_one_line(train(data=test_object), str(test_object), "for testing only")

@@ -275,6 +275,9 @@ def test_a_folder_holds_one_search(tune_with, tmp_path):
     assert_one_line(tune_with("--trials", 2, "--config", config), "frame_gap = 3, not 2")
     config.write_text('{"losses": {"kl": 0.5}}')
     assert_one_line(tune_with("--trials", 2, "--config", config), "holds a search with losses.kl = 0.1, not 0.5;")
+    config.write_text('{"losses": {"kl": 0.5, "knn": 0.1}, "frame_gap": 2}')
+    every = ("losses.knn = 0.018, not 0.1; losses.kl = 0.1, not 0.5", "frame_gap = 3, not 2")
+    assert_one_line(tune_with("--trials", 2, "--config", config), *every)
     (tune_with.out / "tune.json").write_text("{")
     assert_one_line(tune_with("--trials", 2), "tune.json", "is damaged")
     other = tmp_path / "other"

@@ -12,7 +12,7 @@ from data_collection.files import write_json
 from data_collection.ray_cluster import connect
 from envs.errors import UsageError
 from worldmodel.clips import ClipSource
-from worldmodel.train import document_of, first_change
+from worldmodel.train import changes, document_of
 from worldmodel.training_data import open_data, settled
 from worldmodel.tuning import journal
 from worldmodel.tuning.options import TuneOptions
@@ -62,14 +62,15 @@ def settle(options: TuneOptions) -> Data:
         if more and same_ranges:
             before["options"]["trials"] = options.trials
         groups = ("options", "training", "data")
-        changes = [change for group in groups if (change := first_change(before[group], document[group]))]
-        if not same_ranges:  # those of an older version: configurations would be drawn anew
-            changes.append(f"ranges {before['axes']}, not {document['axes']}")
+        found = next(filter(None, (changes(before[group], document[group]) for group in groups)), [])
+        if not found and not same_ranges:  # those of an older version: configurations would be drawn anew
+            found.append(f"ranges {before['axes']}, not {document['axes']}")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UsageError(f"{path} is damaged ({error}); restore it, or give another --out") from error
-    if changes:
+    if found:
         raise UsageError(
-            f"{options.out} holds a search with {changes[0]}; give the same options to go on with it, or another --out"
+            f"{options.out} holds a search with {'; '.join(found)}; give the same options to go on with it, or another "
+            "--out"
         )
     if more:
         if (options.out / RAY).exists():
