@@ -18,7 +18,7 @@ from worldmodel.tuning.space import as_options
 FILES = ("report.json", "report.md", "trials.png", "rank-correlation.png", "best.json")
 
 Document = dict[str, Any]
-_PARTS = dict(zip(PARTS, ("RGB, dB", "depth, dB", "flow error"), strict=True))
+_HEADINGS = dict(zip(PARTS, ("RGB, dB", "depth, dB", "flow error"), strict=True))
 WORSE = 1.2
 """A flow error so many times that of the preset is pointed out."""
 
@@ -104,7 +104,7 @@ def markdown(document: Document) -> str:
     """The report for people."""
     budgets, trials = document["budgets"], document["trials"]
     names = [*document["axes"], "power"]
-    parts = [part for part in _PARTS if any(part in _last(trial) for trial in trials)]
+    parts = [part for part in _HEADINGS if any(part in _last(trial) for trial in trials)]
     lines = [
         f"{len(trials)} of {document['asked']} trials begun ({document['searcher']}): "
         + ", ".join(
@@ -129,15 +129,15 @@ def markdown(document: Document) -> str:
     lines += _table(
         [
             *("trial", "status", *(f"at {budget}" for budget in budgets)),
-            *(_PARTS[part] for part in parts),
+            *(_HEADINGS[part] for part in parts),
             *(name.replace("_", " ") for name in names),
         ],
         [
             [
                 f"{t['number']}{'*' if t['unpruned'] else ''}",
                 t["status"],
-                *(_decibels(t["scores"].get(str(budget))) for budget in budgets),
-                *(_decibels(_last(t).get(part)) for part in parts),
+                *(_rounded(t["scores"].get(str(budget))) for budget in budgets),
+                *(_rounded(_last(t).get(part)) for part in parts),
                 *(f"{t['point'][name]:.3g}" if name in t["point"] else "" for name in names),
             ]
             for t in sorted(trials, key=lambda t: (-t["step"], -(t["score"] or 0)))
@@ -183,7 +183,7 @@ def _table(head: list[str], rows: list[list[str]]) -> list[str]:
     return [f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows]]
 
 
-def _decibels(value: float | None) -> str:
+def _rounded(value: float | None) -> str:
     return "" if value is None else f"{value:.2f}"
 
 
