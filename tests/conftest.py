@@ -1,4 +1,4 @@
-"""Where several processes run the tests at a time, each keeps to one thread, and so do the programs that it starts."""
+"""For several processes that run the tests at a time: each keeps to one thread, and the longest files come first."""
 
 import os
 
@@ -9,7 +9,7 @@ LONGEST = ("test_shipped_model.py", "test_tune_cluster.py", "test_tune.py", "tes
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")  # before NumPy and PyTorch are imported
+        os.environ.setdefault(name, "1")  # before PyTorch is imported; programs that tests start have it, too
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
