@@ -30,7 +30,7 @@ def unroll(
     clips: Clips,
     context: int,
     latents: Tensor | None = None,
-    truth: float = 0.0,
+    truth: float | Tensor = 0.0,
     coins: Tensor | None = None,
     still: bool = False,
 ) -> Rollout:
@@ -41,7 +41,8 @@ def unroll(
         clips: the clip, T frames; with `truth` 0 only its first `context` frames and its actions are looked at.
         context: frames that are always true.
         latents: (B, T-1, Z, H/8, W/8), or None for zeros.
-        truth: probability that a later input is the true frame instead of the predicted one (scheduled sampling).
+        truth: probability that a later input is the true frame instead of the predicted one (scheduled sampling); a
+            tensor () where it changes from call to call of one recorded program.
         coins: (B, T-1) drawn from [0, 1): where a coin is below `truth`, the frame that it leads to stays true. Needed
             where `truth` is neither 0 nor 1.
         still: let nothing move.
@@ -56,9 +57,10 @@ def unroll(
         prediction, memory = model.predict(rgb, depth, clips.actions[:, t], latent, memory, still=still)
         predictions.append(prediction)
         predicted_depth = depth if prediction.depth is None else prediction.depth
-        if t + 1 < context or truth >= 1:
+        always, never = (False, False) if isinstance(truth, Tensor) else (truth >= 1, truth <= 0)
+        if t + 1 < context or always:
             rgb, depth = clips.rgb[:, t + 1], clips.depth[:, t + 1]
-        elif truth <= 0:
+        elif never:
             rgb, depth = prediction.rgb, predicted_depth
         else:
             assert coins is not None

@@ -26,7 +26,7 @@ from worldmodel.trainer import Trainer
 from worldmodel.training_data import model_context, open_data, settled
 from worldmodel.validation import ValidationSet
 
-HOW_NOT_WHAT = ("device", "deterministic", "memory_limit", "save_every", "log_every")
+HOW_NOT_WHAT = ("device", "deterministic", "cuda_graphs", "memory_limit", "save_every", "log_every")
 """Options that a run may go on with others of."""
 
 

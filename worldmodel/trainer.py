@@ -7,7 +7,6 @@ import math
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from envs.errors import UsageError
-from worldmodel import losses
 from worldmodel.ahead import Ahead
 from worldmodel.checkpoint import load_training, save_model, save_training
 from worldmodel.clips import Clips, ClipSource
@@ -24,11 +22,11 @@ from worldmodel.colour_jitter import ColourJitter
 from worldmodel.devices import find_precision
 from worldmodel.inference import InferenceNetwork, inference_network
 from worldmodel.journal import Journal, finite
-from worldmodel.objective import reconstruction_terms
+from worldmodel.objective import StepInputs, objective
 from worldmodel.options import TrainOptions
 from worldmodel.pictures import picture_prediction
 from worldmodel.ranks import ALONE, Ranks
-from worldmodel.rollout import unroll
+from worldmodel.recording import Recorder
 from worldmodel.stopping import stop_signals
 from worldmodel.validation import Scores, ValidationSet, summary, validate
 from worldmodel.world_model import WorldModel
@@ -81,6 +79,9 @@ class Trainer:
         self._draw_ahead: Callable[[int], tuple[Clips, ColourJitter | None]] = self._draw
         if self.device.type == "cuda" or not train.in_memory:
             self._draw_ahead = Ahead(self._draw, options.steps)
+        self._compute: Callable[[StepInputs], dict[str, Tensor]] = self._differentiate
+        if self.device.type == "cuda" and options.cuda_graphs:
+            self._compute = Recorder(self._differentiate, parameters)
         self.step, self.best, self.seconds = 0, -math.inf, 0.0
         self.bad_steps = 0
 
@@ -144,13 +145,11 @@ class Trainer:
         """
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate
-        total, terms = self.objective(clips)
+        terms = self._told(self._compute(self.inputs(clips)))
         bad = [name for name, value in terms.items() if not math.isfinite(value)]
         if bad:
             self._skip(f"loss (terms: {', '.join(bad)})")
             return terms
-        self.optimiser.zero_grad(set_to_none=True)
-        total.backward()
         self.ranks.average_gradients(self.parameters)
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.options.clip_gradient)
         if torch.isfinite(norm):
@@ -175,24 +174,44 @@ class Trainer:
             )
 
     def objective(self, clips: Clips) -> tuple[Tensor, dict[str, float]]:
-        """The full objective (paper, section III-F) on this rank's clips, and its unweighted terms on those of all.
+        """The full objective (paper, section III-F) on this rank's clips, and its unweighted terms on those of all."""
+        total, terms = objective(self.model, self.inference, self.inputs(clips), self.options)
+        return total, self._told({"loss": total, **terms})
 
-        Every term is a mean over equally many pixels of each clip, so that the mean over ranks is that over the batch.
-        """
-        options, weights = self.options, self.options.losses
-        noise = torch.Generator().manual_seed(_mix(options.seed, self.step))
-        schedule = options.schedule
+    def _differentiate(self, inputs: StepInputs) -> dict[str, Tensor]:
+        """Set this rank's gradients; returns the loss and its terms."""
+        self.optimiser.zero_grad(set_to_none=True)
+        total, terms = objective(self.model, self.inference, inputs, self.options)
+        total.backward()
+        return {name: value.detach() for name, value in {"loss": total, **terms}.items()}
+
+    def _told(self, terms: dict[str, Tensor]) -> dict[str, float]:
+        """Terms as numbers, the means over all ranks: every term is a mean over equally many pixels of each clip."""
+        values = self.ranks.mean(torch.stack(list(terms.values())).detach()).tolist()
+        return dict(zip(terms, values, strict=True))
+
+    def inputs(self, clips: Clips) -> StepInputs:
+        """This rank's clips with all that this step draws and where it stands in the schedule."""
+        schedule, device = self.options.schedule, self.device
+        draw = torch.Generator().manual_seed(_mix(self.options.seed, self.step))
+        clip_count, steps = len(clips.rgb) * self.ranks.count, clips.actions.shape[1]
+        noise = None
+        if self.inference is not None:
+            each = 1 if self.model.config.latents == "clip" else steps
+            noise = self._my(torch.randn((clip_count, each, *self.model.latent_shape), generator=draw))
+        coins = self._my(torch.rand((clip_count, steps), generator=draw))
         truth = 1 - _ramp(self.progress, 0.0, schedule.truth_until)
-        latents, kl = self._latents(clips, noise)
-        coins = self._my(torch.rand((len(clips.rgb) * self.ranks.count, clips.actions.shape[1]), generator=noise))
-        rollout = unroll(self.model, clips, options.context, latents, truth, coins)
-        terms = reconstruction_terms(self.model, rollout, clips, weights)
-        if kl is not None:
-            terms["kl"] = kl
-        scale = {**asdict(weights), "kl": weights.kl * _ramp(self.progress, *schedule.kl_ramp)}
-        total = torch.stack([scale[name] * value for name, value in terms.items()]).sum()
-        values = self.ranks.mean(torch.stack([total, *terms.values()]).detach()).tolist()
-        return total, dict(zip(("loss", *terms), values, strict=True))
+        return StepInputs(
+            rgb=clips.rgb,
+            depth=clips.depth,
+            actions=clips.actions,
+            noise=noise,
+            coins=coins,
+            truth=torch.tensor(truth, device=device),
+            kl_weight=torch.tensor(self.options.losses.kl * _ramp(self.progress, *schedule.kl_ramp), device=device),
+            inferred=self.inference is not None and self.progress >= schedule.posterior_from,
+            taught=truth > 0,
+        )
 
     @property
     def progress(self) -> float:
@@ -223,21 +242,6 @@ class Trainer:
         if options.colour_jitter <= 0:
             return clips, None
         return clips, ColourJitter.draw(options.batch, options.colour_jitter, rng).share(self.share)
-
-    def _latents(self, clips: Clips, noise: torch.Generator) -> tuple[Tensor | None, Tensor | None]:
-        if self.inference is None:
-            return None, None
-        batch, steps = clips.actions.shape[:2]
-        each = 1 if self.model.config.latents == "clip" else steps
-        draws = torch.randn((batch * self.ranks.count, each, *self.model.latent_shape), generator=noise)
-        draws = self._my(draws).expand(-1, steps, -1, -1, -1)
-        if self.progress < self.options.schedule.posterior_from:
-            return draws, None
-        frames = self.model.frame(clips.rgb, clips.depth)
-        with torch.autocast(self.device.type, self.model.precision, enabled=self.model.precision != torch.float32):
-            mean, log_variance = self.inference(frames)
-        pixels = self.model.camera.height * self.model.camera.width
-        return mean + (0.5 * log_variance).exp() * draws, losses.kl_to_prior(mean, log_variance, pixels)
 
     def _my(self, draws: Tensor) -> Tensor:
         """This rank's share of random draws for the clips of all ranks, on its device."""

@@ -21,12 +21,13 @@ from worldmodel.t3vip import T3VIP
 WAY_M = np.array([0.1, 0.15, 0.15])  # from the TCP to the goal
 
 
-def action_seconds(decisions: int, search: dict[str, Any]) -> dict[str, Any]:
+def action_seconds(decisions: int, search: dict[str, Any], device: str = "cpu") -> dict[str, Any]:
     """Median seconds of a decision of the T3VIP controller on tabletop D, after the first.
 
     Args:
         decisions: how many count.
         search: changes to the default `ICEMConfig`.
+        device: where the model runs.
 
     Returns:
         "seconds"; "rollouts" of one decision; "model", `shipped` or, where none is shipped, `untrained`.
@@ -40,7 +41,7 @@ def action_seconds(decisions: int, search: dict[str, Any]) -> dict[str, Any]:
         model, kind = T3VIP(PRESETS["cpu"].architecture, _context(tabletop)).eval(), "untrained"
     config = ICEMConfig(**search)
     planner = ICEM(config, -np.ones(3), np.ones(3), np.random.default_rng(0))
-    controller = T3VIPController(model, tabletop.camera, planner)
+    controller = T3VIPController(model.to(device), tabletop.camera, planner)
     point = tabletop.tcp_position + WAY_M
     controller.reset(observation, Goal(point, tabletop.camera.project(tabletop.camera.to_camera(point))))
     while len(controller.plan_seconds) <= decisions:

@@ -53,7 +53,7 @@ def as_plainly(kind: str) -> contextlib.AbstractContextManager[object]:
     return torch.compiler.set_stance("force_eager") if kind == "plain" else contextlib.nullcontext()
 
 
-def make_trainer(kind: str, preset: str, **changes: Any) -> Trainer:
+def make_trainer(kind: str, preset: str, device: str = "cpu", **changes: Any) -> Trainer:
     """A trainer late in its run: "ours" as `train-worldmodel` makes it, or "plain": fp32, default layout."""
     options: TrainOptions = replace(PRESETS[preset], data=Path("unused"), out=Path("unused"), **changes)
     torch.manual_seed(options.seed)
@@ -65,6 +65,7 @@ def make_trainer(kind: str, preset: str, **changes: Any) -> Trainer:
     else:
         keep_freed_memory()
         model = make_model(name, architecture, context).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    model = model.to(device)
     source = ClipSource(MadeUpDataset(), options.frame_gap)  # type: ignore[arg-type]
     trainer = Trainer(model, options, source, None, {})  # type: ignore[arg-type]  # nothing is validated
     trainer.step = round(LATE * options.steps)
