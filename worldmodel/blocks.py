@@ -78,6 +78,15 @@ class Upsample(nn.ConvTranspose2d):
         return _Up.apply(x, weight, bias)
 
 
+class PreciseLinear(nn.Linear):
+    """A linear layer that runs in float32 whatever autocast says."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """`(..., inputs)` to `(..., outputs)`, float32."""
+        with torch.autocast(x.device.type, enabled=False):
+            return super().forward(x.float())
+
+
 def _tanh(x: Tensor) -> Tensor:
     """As a sigmoid, which is exact to 2e-7 and compiles to an exponential, three times as fast as C's tanh."""
     return 2 * torch.sigmoid(2 * x) - 1

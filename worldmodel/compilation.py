@@ -17,6 +17,9 @@ from tqdm import tqdm
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 logger = logging.getLogger(__name__)
+SHAPES = 64
+"""For so many sets of shapes a function is compiled before it runs as it is. PyTorch's 8 are soon used up by a
+curriculum of several clip lengths."""
 OLDEST_GPU = (7, 0)
 """Compute capability from which on Triton makes kernels."""
 ONE_LOOP = {"realize_reads_threshold": 1000, "realize_opcount_threshold": 10_000, "realize_acc_reads_threshold": 10_000}
@@ -68,6 +71,9 @@ def compiled(function: Function) -> Function:
         if failed or torch.compiler.is_compiling() or not can_compile(device):
             return function(*args, **kwargs)
         if fast is None:
+            from torch._dynamo import config
+
+            config.recompile_limit = max(config.recompile_limit, SHAPES)
             fast = torch.compile(function, dynamic=False, options=_one_loop() if device == "cpu" else None)
         try:
             return fast(*args, **kwargs)

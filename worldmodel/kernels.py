@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from worldmodel.advection import advect
-from worldmodel.blocks import LSTMState
+from worldmodel.blocks import LSTMState, PreciseLinear
 from worldmodel.config import ModelConfig, ModelContext
 from worldmodel.trunk import Decoder, scaled
 from worldmodel.world_model import Prediction, WorldModel
@@ -64,7 +64,7 @@ class KernelHead(nn.Module):
         self.count, self.size = count, size
         self.first = nn.Linear(inputs, wide)
         self.second = nn.Linear(wide + action_dim, narrow)
-        self.last = nn.Linear(narrow + action_dim, count * size**2)
+        self.last = PreciseLinear(narrow + action_dim, count * size**2)
         with torch.no_grad():
             self.last.bias.view(count, size, size)[:, size // 2, size // 2] += 1.0
 
@@ -72,8 +72,8 @@ class KernelHead(nn.Module):
         """Returns (B, K, S, S) float32."""
         x = F.relu(self.first(embedding.flatten(1)))
         x = F.relu(self.second(torch.cat((x, action.to(x.dtype)), dim=1)))
+        x = self.last(torch.cat((x.float(), action.float()), dim=1)).unflatten(1, (self.count, -1))
         with torch.autocast(x.device.type, enabled=False):
-            x = self.last(torch.cat((x.float(), action.float()), dim=1)).unflatten(1, (self.count, -1))
             x = F.relu(x - LEAST_WEIGHT) + LEAST_WEIGHT
             return (x / x.sum(-1, keepdim=True)).unflatten(-1, (self.size, self.size))
 

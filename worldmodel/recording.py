@@ -47,7 +47,7 @@ class Recorder(Generic[Inputs]):
     def __init__(self, function: Callable[[Inputs], dict[str, Tensor]], parameters: Sequence[nn.Parameter]) -> None:
         self._function, self._parameters = function, parameters
         self._recordings: dict[Hashable, Recording[Inputs]] = {}
-        self._memory: tuple[int, int] | None = None  # recordings share it: only one of them runs at a time
+        self._memory: Any = None  # recordings share it: only one of them runs at a time
         self._failed = False
 
     def __call__(self, inputs: Inputs) -> dict[str, Tensor]:

@@ -51,20 +51,21 @@ def unroll(
     memory = model.blank_memory(rgb)
     predictions: list[Prediction] = []
     inputs = []
-    for t in range(clips.actions.shape[1]):
-        inputs.append(rgb)
-        latent = None if latents is None else latents[:, t]
-        prediction, memory = model.predict(rgb, depth, clips.actions[:, t], latent, memory, still=still)
-        predictions.append(prediction)
-        predicted_depth = depth if prediction.depth is None else prediction.depth
-        always, never = (False, False) if isinstance(truth, Tensor) else (truth >= 1, truth <= 0)
-        if t + 1 < context or always:
-            rgb, depth = clips.rgb[:, t + 1], clips.depth[:, t + 1]
-        elif never:
-            rgb, depth = prediction.rgb, predicted_depth
-        else:
-            assert coins is not None
-            true = (coins[:, t] < truth).view(-1, 1, 1, 1)
-            rgb = torch.where(true, clips.rgb[:, t + 1], prediction.rgb)
-            depth = torch.where(true, clips.depth[:, t + 1], predicted_depth)
+    with model.lending():
+        for t in range(clips.actions.shape[1]):
+            inputs.append(rgb)
+            latent = None if latents is None else latents[:, t]
+            prediction, memory = model.predict(rgb, depth, clips.actions[:, t], latent, memory, still=still)
+            predictions.append(prediction)
+            predicted_depth = depth if prediction.depth is None else prediction.depth
+            always, never = (False, False) if isinstance(truth, Tensor) else (truth >= 1, truth <= 0)
+            if t + 1 < context or always:
+                rgb, depth = clips.rgb[:, t + 1], clips.depth[:, t + 1]
+            elif never:
+                rgb, depth = prediction.rgb, predicted_depth
+            else:
+                assert coins is not None
+                true = (coins[:, t] < truth).view(-1, 1, 1, 1)
+                rgb = torch.where(true, clips.rgb[:, t + 1], prediction.rgb)
+                depth = torch.where(true, clips.depth[:, t + 1], predicted_depth)
     return Rollout(predictions, torch.stack(inputs, dim=1))

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from worldmodel import geometry
-from worldmodel.blocks import LSTMState
+from worldmodel.blocks import LSTMState, PreciseLinear
 from worldmodel.config import ModelConfig, ModelContext
 from worldmodel.splatting import MIN_COVERAGE, splat
 from worldmodel.trunk import Decoder, scaled
@@ -73,7 +73,7 @@ class TransformHead(nn.Module):
         wide, narrow = scaled(256, width), scaled(128, width)
         self.first = nn.Linear(inputs, wide)
         self.second = nn.Linear(wide + action_dim, narrow)
-        self.last = nn.Linear(narrow + action_dim, 9 * count)
+        self.last = PreciseLinear(narrow + action_dim, 9 * count)
         nn.init.uniform_(self.last.weight, -1e-4, 1e-4)
         nn.init.zeros_(self.last.bias)
         if shift:
@@ -86,9 +86,8 @@ class TransformHead(nn.Module):
         """Returns rotations (B, K-1, 3, 3) and translations (B, K-1, 3) in metres, float32."""
         x = F.relu(self.first(embedding.flatten(1)))
         x = F.relu(self.second(torch.cat((x, action.to(x.dtype)), dim=1)))
-        # The last layer is tiny and decides on millimetres: always in float32.
+        x = self.last(torch.cat((x.float(), action.float()), dim=1)).unflatten(1, (-1, 9))  # it decides on millimetres
         with torch.autocast(x.device.type, enabled=False):
-            x = self.last(torch.cat((x.float(), action.float()), dim=1)).unflatten(1, (-1, 9))
             return geometry.rotation_from_6d(x[..., 3:] + self.identity), self.unit * x[..., :3]
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -13,6 +15,7 @@ from envs.camera import CameraModel
 from envs.errors import UsageError
 from worldmodel.blocks import LSTMState
 from worldmodel.config import ModelConfig, ModelContext
+from worldmodel.lending import WeightLoan
 from worldmodel.trunk import STRIDE, Encoder, Skips
 
 
@@ -85,6 +88,7 @@ class WorldModel(nn.Module, ABC):
         self.config, self.context = config, context
         self.precision = torch.float32
         """What the network runs in; geometry, warping and blending always run in float32."""
+        self._borrowing: Callable[[], AbstractContextManager[None]] = nullcontext
         self.camera = CameraModel.from_json(context.camera)
         height, width = self.camera.height, self.camera.width
         if height % STRIDE or width % STRIDE:
@@ -202,7 +206,7 @@ class WorldModel(nn.Module, ABC):
         if self.latent_channels and latent is None:
             latent = rgb.new_zeros((batch, *self.latent_shape))
         device = rgb.device.type
-        with torch.autocast(device, self.precision, enabled=self.precision != torch.float32):
+        with torch.autocast(device, self.precision, enabled=self.precision != torch.float32), self._borrowing():
             heads, states = self.network(frame, action, latent, memory.states, paint)
         if len(rgb) < batch:
             rgb, depth, memory = expand(rgb, batch), expand(depth, batch), Memory([], memory.first)
@@ -210,6 +214,20 @@ class WorldModel(nn.Module, ABC):
         with torch.autocast(device, enabled=False):
             prediction = self.render(rgb.float(), depth.float(), heads, memory.first, still, picture)
         return prediction, Memory(states, memory.first)
+
+    @contextmanager
+    def lending(self) -> Iterator[None]:
+        """Within the block, in which weights must not change, they are cast to the network's precision only once."""
+        if self.precision == torch.float32:
+            yield
+            return
+        loan = WeightLoan(self, self.precision)
+        account = loan.open()
+        self._borrowing = lambda: loan.frame(account)
+        try:
+            yield
+        finally:
+            self._borrowing = nullcontext
 
     def frame(self, rgb: Tensor, depth: Tensor) -> Tensor:
         """What the network sees of a frame: RGB, and for an RGB-D model depth scaled to [0, 1]; (..., C, H, W)."""

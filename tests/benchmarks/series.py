@@ -73,4 +73,39 @@ def _points(preset: str, quick: bool) -> dict[str, Point]:
     return points
 
 
-SERIES: dict[str, Callable[[bool], list[Result]]] = {"scaling": scaling}
+def gpu(quick: bool) -> list[Result]:
+    """Seconds of a training step on a GPU: replayed or launched, compiled or not, and over sizes."""
+    repeats = 2 if quick else 15
+    peaks = measure("gpu.peaks", repeats=repeats)
+    base = _base("tiny" if quick else "cpu") | {"preset": "cpu", "precision": "bfloat16"}
+    base |= {"graphs": True, "compiled": True}
+    points = [base | change for change in GPU_CHANGES[: 2 if quick else None]]
+    results = [Result(f"peak_{name}", peaks[name], unit, f"what {peaks['name']} can do", 1.0) for name, unit in PEAKS]
+    for found in measure("gpu.steps", points=points, repeats=repeats):
+        floor = 1e-3 * found["gflop"] / peaks[found["precision"]]
+        what = (
+            f"the floor: {found['gflop']:.4g} GFLOP at the peak; the first step took {found['first']:.3g} s, "
+            f"{found['gib']:.2g} GiB"
+        )
+        how = "replayed" if found["graphs"] else "launched"
+        compiled = "compiled" if found["compiled"] else "not compiled"
+        sizes = "batch {batch}, width {width:g}, {frames} frames, {precision}, preset {preset}".format(**found)
+        results.append(cost(f"step: {sizes}, {how}, {compiled}", found["seconds"], "s", floor, what))
+    return results
+
+
+PEAKS = (("float32", "TFLOP/s"), ("bfloat16", "TFLOP/s"), ("copy", "GB/s"))
+GPU_CHANGES: tuple[Point, ...] = (
+    {},
+    {"compiled": False},
+    {"graphs": False},
+    {"graphs": False, "compiled": False},
+    {"precision": "float32"},
+    {"batch": 4},
+    {"batch": 64},
+    {"frames": 4},
+    {"width": 1.0},
+    {"width": 1.0, "preset": "paper"},
+)
+"""What differs from the `cpu` preset at the end of its curriculum, replayed and compiled."""
+SERIES: dict[str, Callable[[bool], list[Result]]] = {"scaling": scaling, "gpu": gpu}
