@@ -71,9 +71,7 @@ def compiled(function: Function) -> Function:
         if failed or torch.compiler.is_compiling() or not can_compile(device):
             return function(*args, **kwargs)
         if fast is None:
-            from torch._dynamo import config
-
-            config.recompile_limit = max(config.recompile_limit, SHAPES)
+            _allow_shapes()
             fast = torch.compile(function, dynamic=False, options=_one_loop() if device == "cpu" else None)
         try:
             return fast(*args, **kwargs)
@@ -88,6 +86,13 @@ def compiled(function: Function) -> Function:
             return function(*args, **kwargs)
 
     return call  # type: ignore[return-value]
+
+
+def _allow_shapes() -> None:
+    from torch._dynamo import config
+
+    limit = "recompile_limit" if hasattr(config, "recompile_limit") else "cache_size_limit"  # before PyTorch 2.7
+    setattr(config, limit, max(getattr(config, limit), SHAPES))
 
 
 def _one_loop() -> dict[str, Any]:

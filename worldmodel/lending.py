@@ -64,7 +64,7 @@ class WeightLoan:
         self._sum = together.float() if self._sum is None else self._sum.add_(together)
 
     def settle(self) -> list[Tensor]:
-        """The sum of all gradients taken in, float32, one for each weight."""
+        """The sum of all gradients taken in, float32, one for each weight; 0 for one that no frame used."""
         assert self._sum is not None
         parts, self._sum = self._sum.split([weight.numel() for weight in self.cast]), None
         return [_unflat(part, weight) for part, weight in zip(parts, self.cast, strict=True)]

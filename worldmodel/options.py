@@ -116,7 +116,8 @@ class TrainOptions:
     deterministic: bool = False
     """Have the same run give the same bits on the same machine, also on a GPU, at some cost in speed there."""
     cuda_graphs: bool = True
-    """On a GPU, record what a step does there and replay it, instead of launching thousands of kernels one by one."""
+    """On a GPU, record what a step does there and replay it, instead of launching thousands of kernels one by one.
+    Takes about the memory of a step more."""
     memory_limit: float | None = None
     """GB that the pictures of the datasets may take in memory; larger ones are read from the disk as they are needed.
     By default half of what is free, shared by the processes of torchrun."""

@@ -6,6 +6,7 @@ replayed as a CUDA graph they follow each other at once.
 
 from __future__ import annotations
 
+import gc
 import logging
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -52,39 +53,47 @@ class Recorder(Generic[Inputs]):
 
     def __call__(self, inputs: Inputs) -> dict[str, Tensor]:
         """The function's outputs and gradients, which hold until the next call."""
-        if self._failed:
-            return self._function(inputs)
-        kind = _kind(inputs)
-        if kind not in self._recordings:
-            try:
-                self._recordings[kind] = self._record(inputs)
-            except RuntimeError as error:
-                self._failed = True
-                self._recordings.clear()
-                with tqdm.external_write_mode():
-                    reason = str(error).strip().splitlines()[0]
-                    logger.warning("steps run without CUDA graphs, which is slower: recording failed (%s)", reason)
+        with torch.cuda.device_of(self._parameters[0]):
+            recording = self._recording(inputs)
+            if recording is None:
                 return self._function(inputs)
-        recording = self._recordings[kind]
-        for name, tensor in _tensors(inputs).items():
-            getattr(recording.inputs, name).copy_(tensor)
-        recording.graph.replay()
+            for name, tensor in _tensors(inputs).items():
+                getattr(recording.inputs, name).copy_(tensor)
+            recording.graph.replay()
         for parameter, gradient in zip(self._parameters, recording.gradients, strict=True):
             parameter.grad = gradient
         return recording.outputs
 
+    def _recording(self, inputs: Inputs) -> Recording[Inputs] | None:
+        """That of the inputs' kind, made if need be; None once one could not be made."""
+        kind = _kind(inputs)
+        if kind not in self._recordings and not self._failed:
+            try:
+                self._recordings[kind] = self._record(inputs)
+            except RuntimeError as error:  # what it holds is free again once this block is left
+                self._failed = True
+                self._recordings.clear()
+                reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+                with tqdm.external_write_mode():
+                    logger.warning("steps run without CUDA graphs, which is slower: recording failed (%s)", reason)
+        return None if self._failed else self._recordings[kind]
+
     def _record(self, inputs: Inputs) -> Recording[Inputs]:
+        gc.collect()  # now, lest it free the recordings of a trainer that is gone while this one is being made
         own: Any = replace(inputs, **{name: t.clone() for name, t in _tensors(inputs).items()})  # type: ignore[type-var]
-        aside = torch.cuda.Stream()
-        aside.wait_stream(torch.cuda.current_stream())
+        here, aside = torch.cuda.current_stream(), torch.cuda.Stream()
+        aside.wait_stream(here)
         with torch.cuda.stream(aside):
             for _ in range(WARM_UPS):
                 self._function(own)
-        torch.cuda.current_stream().wait_stream(aside)
+        here.wait_stream(aside)
         graph = torch.cuda.CUDAGraph()
-        # Other threads may go on meanwhile: the next step's clips are being copied into pinned memory.
-        with torch.cuda.graph(graph, pool=self._memory, capture_error_mode="thread_local"):
-            outputs = self._function(own)
+        try:
+            # Other threads may go on meanwhile: the next step's clips are being copied into pinned memory.
+            with torch.cuda.graph(graph, pool=self._memory, capture_error_mode="thread_local"):
+                outputs = self._function(own)
+        finally:
+            torch.cuda.set_stream(here)  # a recording that fails does not go back by itself
         self._memory = graph.pool()
         return Recording(graph, own, outputs, [parameter.grad for parameter in self._parameters])
 

@@ -79,9 +79,9 @@ class Trainer:
         self._draw_ahead: Callable[[int], tuple[Clips, ColourJitter | None]] = self._draw
         if self.device.type == "cuda" or not train.in_memory:
             self._draw_ahead = Ahead(self._draw, options.steps)
-        self._compute: Callable[[StepInputs], dict[str, Tensor]] = self._differentiate
+        self._compute: Callable[[StepInputs], dict[str, Tensor]] = self.differentiate
         if self.device.type == "cuda" and options.cuda_graphs:
-            self._compute = Recorder(self._differentiate, parameters)
+            self._compute = Recorder(self.differentiate, parameters)
         self.step, self.best, self.seconds = 0, -math.inf, 0.0
         self.bad_steps = 0
 
@@ -145,7 +145,7 @@ class Trainer:
         """
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate
-        terms = self._told(self._compute(self.inputs(clips)))
+        terms = self._numbers(self._compute(self.inputs(clips)))
         bad = [name for name, value in terms.items() if not math.isfinite(value)]
         if bad:
             self._skip(f"loss (terms: {', '.join(bad)})")
@@ -173,19 +173,14 @@ class Trainer:
                 "lower --learning-rate"
             )
 
-    def objective(self, clips: Clips) -> tuple[Tensor, dict[str, float]]:
-        """The full objective (paper, section III-F) on this rank's clips, and its unweighted terms on those of all."""
-        total, terms = objective(self.model, self.inference, self.inputs(clips), self.options)
-        return total, self._told({"loss": total, **terms})
-
-    def _differentiate(self, inputs: StepInputs) -> dict[str, Tensor]:
-        """Set this rank's gradients; returns the loss and its terms."""
+    def differentiate(self, inputs: StepInputs) -> dict[str, Tensor]:
+        """Set the gradients of this rank's objective anew; returns the loss and its unweighted terms."""
         self.optimiser.zero_grad(set_to_none=True)
         total, terms = objective(self.model, self.inference, inputs, self.options)
         total.backward()
         return {name: value.detach() for name, value in {"loss": total, **terms}.items()}
 
-    def _told(self, terms: dict[str, Tensor]) -> dict[str, float]:
+    def _numbers(self, terms: dict[str, Tensor]) -> dict[str, float]:
         """Terms as numbers, the means over all ranks: every term is a mean over equally many pixels of each clip."""
         values = self.ranks.mean(torch.stack(list(terms.values())).detach()).tolist()
         return dict(zip(terms, values, strict=True))

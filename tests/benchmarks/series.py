@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from tests.benchmarks.child import measure
+from tests.benchmarks.child import BenchmarkFailed, measure
 from tests.benchmarks.result import Result, cost
 from worldmodel.devices import best_precision
 from worldmodel.options import PRESETS
@@ -74,7 +74,9 @@ def _points(preset: str, quick: bool) -> dict[str, Point]:
 
 
 def gpu(quick: bool) -> list[Result]:
-    """Seconds of a training step on a GPU: replayed or launched, compiled or not, and over sizes."""
+    """Seconds of a training step on a GPU (replayed or launched, compiled or not, over sizes), and of a plan."""
+    if not torch.cuda.is_available():
+        raise BenchmarkFailed("no GPU that PyTorch can use is here, and this measures one")
     repeats = 2 if quick else 15
     peaks = measure("gpu.peaks", repeats=repeats)
     base = _base("tiny" if quick else "cpu") | {"preset": "cpu", "precision": "bfloat16"}
@@ -91,9 +93,12 @@ def gpu(quick: bool) -> list[Result]:
         compiled = "compiled" if found["compiled"] else "not compiled"
         sizes = "batch {batch}, width {width:g}, {frames} frames, {precision}, preset {preset}".format(**found)
         results.append(cost(f"step: {sizes}, {how}, {compiled}", found["seconds"], "s", floor, what))
+    plan = measure("planning.action_seconds", decisions=repeats, search={}, device="cuda")
+    results.append(cost("plan", plan["seconds"], "s", HELD_S, f"how long it is held; {plan['rollouts']} rollouts"))
     return results
 
 
+HELD_S = 0.1
 PEAKS = (("float32", "TFLOP/s"), ("bfloat16", "TFLOP/s"), ("copy", "GB/s"))
 GPU_CHANGES: tuple[Point, ...] = (
     {},

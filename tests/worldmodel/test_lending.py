@@ -39,9 +39,9 @@ def test_gradients_have_the_same_bits(make_model, clips, name):
 
     ours, theirs = gradients(model(), clips), gradients(model(), clips, lending=False)
     assert ours.keys() == theirs.keys() and len(ours) > 50
-    for name, gradient in theirs.items():
-        assert gradient.dtype == ours[name].dtype == torch.float32
-        assert torch.equal(ours[name], gradient), name
+    for weight, gradient in theirs.items():
+        assert gradient.dtype == ours[weight].dtype == torch.float32
+        assert torch.equal(ours[weight], gradient), weight
     assert any(gradient.abs().max() > 0 for gradient in theirs.values())
 
 
@@ -57,7 +57,7 @@ def test_layers_work_with_the_cast_weights_until_the_frame_is_done(make_model):
     assert model.encoder.conv0.weight is weight and isinstance(weight, nn.Parameter)
 
 
-def test_a_weight_that_nobody_used_gets_no_motion(make_model):
+def test_the_gradient_of_a_weight_that_no_frame_used_is_zero(make_model):
     model = make_model()
     loan = WeightLoan(model, torch.bfloat16)
     account = loan.open()
@@ -69,8 +69,27 @@ def test_a_weight_that_nobody_used_gets_no_motion(make_model):
 
 def test_in_float32_nothing_is_lent(make_model):
     model = make_model()
+    weight = model.encoder.conv0.weight
     with model.lending(), model._borrowing():
-        assert model.encoder.conv0.weight.dtype == torch.float32
+        assert model.encoder.conv0.weight is weight
+
+
+def test_an_unroll_that_fails_lends_no_more(make_model):
+    model = make_model()
+    model.precision = torch.bfloat16
+    with pytest.raises(ZeroDivisionError), model.lending():
+        raise ZeroDivisionError
+    weight = model.encoder.conv0.weight
+    with model._borrowing():
+        assert model.encoder.conv0.weight is weight
+
+
+@torch.inference_mode()
+def test_predictions_are_the_same(make_model, clips):
+    lent, cast = make_model(), make_model()
+    lent.precision = cast.precision = torch.bfloat16
+    cast.lending = nullcontext
+    assert torch.equal(unroll(lent, clips, 2).stack("rgb"), unroll(cast, clips, 2).stack("rgb"))
 
 
 def test_a_step_leaves_nothing_behind(make_model, clips, monkeypatch):

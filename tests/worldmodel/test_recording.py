@@ -1,6 +1,7 @@
 """A step that is recorded and replayed trains as one that is launched. What needs a GPU runs where there is one."""
 
 import logging
+import weakref
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -40,28 +41,41 @@ def test_a_kind_is_shapes_types_and_plain_values():
     assert len({_kind(some), _kind(replace(some, squared=False)), *map(_kind, others)}) == 5
 
 
-def test_what_cannot_be_recorded_runs_as_it_is(caplog):
-    """Here without a GPU, on one when a recording fails: a warning, once, and the same gradients."""
+@pytest.mark.parametrize(
+    ("kind", "message", "reason"),
+    [
+        (RuntimeError, "not permitted\nwhen capturing", "not permitted"),
+        (torch.OutOfMemoryError, "", "OutOfMemoryError"),
+    ],
+)
+def test_what_cannot_be_recorded_runs_as_it_is(caplog, kind, message, reason):
+    """With a failure that is made up: a warning, once, the same gradients, and nothing of the failure left by then."""
     weight = nn.Parameter(torch.tensor([1.0, 2.0, 3.0]))
+    held = []
 
     def differentiate(inputs):
+        assert held[0]() is None
         weight.grad = None
         loss = (weight * inputs.x).sum()
         loss.backward()
         return {"loss": loss.detach()}
 
+    def record(inputs):
+        large = torch.zeros(3)
+        held.append(weakref.ref(large))
+        raise kind(message)
+
     recorder = Recorder(differentiate, [weight])
-    recorder._record = lambda inputs: (_ for _ in ()).throw(RuntimeError("operation not permitted\nwhen capturing"))
+    recorder._record = record
     with caplog.at_level(logging.WARNING):
         for factor in (1.0, 2.0):
             told = recorder(Inputs(torch.full((3,), factor), None, True))
             assert told["loss"] == 6 * factor and torch.equal(weight.grad, torch.full((3,), factor))
-    assert [record.message for record in caplog.records] == [
-        "steps run without CUDA graphs, which is slower: recording failed (operation not permitted)"
-    ]
+    said = [record.message for record in caplog.records]
+    assert said == [f"steps run without CUDA graphs, which is slower: recording failed ({reason})"]
 
 
-def test_a_kind_is_recorded_once_and_fed_each_time(monkeypatch):
+def test_a_kind_is_recorded_once_and_fed_each_time():
     """With a recording that stands in for a GPU's: the inputs it owns are overwritten, gradients are handed on."""
     weight = nn.Parameter(torch.ones(2))
     recorder = Recorder(lambda inputs: {}, [weight])
@@ -89,24 +103,34 @@ def test_a_kind_is_recorded_once_and_fed_each_time(monkeypatch):
     assert len(made) == 2
 
 
-def test_the_objective_is_made_of_its_inputs_alone(make_model, source):
-    """What is replayed sees no clock: the same inputs give the same objective, and each of them counts."""
-    options = replace(PRESETS["tiny"], data=Path("squares"), out=Path("run"), batch=2, schedule=PHASES)
-    model = make_model()
-    inference = inference_network(model)
-    clips = source.at(source.spread(2, 4), 4)
+@pytest.fixture
+def options():
+    return replace(PRESETS["tiny"], data=Path("squares"), out=Path("run"), batch=2, schedule=PHASES)
+
+
+def inputs_of(model, clips):
+    """Half way through a run: latents inferred, some inputs true."""
     draw = torch.Generator().manual_seed(0)
-    inputs = StepInputs(
+    noise = torch.randn((2, 1 if model.config.latents == "clip" else 3, *model.latent_shape), generator=draw)
+    return StepInputs(
         clips.rgb,
         clips.depth,
         clips.actions,
-        torch.randn((2, 3, *model.latent_shape), generator=draw),
+        noise if model.latent_channels else None,
         torch.tensor([[0.1, 0.2, 0.3], [0.9, 0.8, 0.7]]),
         torch.tensor(0.5),
         torch.tensor(0.1),
-        inferred=True,
+        inferred=model.latent_channels > 0,
         taught=True,
     )
+
+
+@pytest.mark.parametrize("latents", ["step", "clip"])
+def test_the_objective_is_made_of_its_inputs_alone(make_model, source, options, latents):
+    """What is replayed sees no clock: the same inputs give the same objective, and each of them counts."""
+    model = make_model(latents=latents)
+    inference = inference_network(model)
+    inputs = inputs_of(model, source.at(source.spread(2, 4), 4))
 
     @torch.no_grad()
     def total(**changes):
@@ -114,6 +138,9 @@ def test_the_objective_is_made_of_its_inputs_alone(make_model, source):
 
     assert total() == total()
     for changes in (
+        {"rgb": 0.5 * inputs.rgb},
+        {"depth": 0.9 * inputs.depth},
+        {"actions": inputs.actions + 1},
         {"noise": inputs.noise + 1},
         {"coins": 1 - inputs.coins},
         {"truth": torch.tensor(0.0)},
@@ -123,6 +150,18 @@ def test_the_objective_is_made_of_its_inputs_alone(make_model, source):
     ):
         assert total(**changes) != total(), changes
     assert total(taught=False) == pytest.approx(total(truth=torch.tensor(0.0)), rel=1e-6)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("config", [{"latents": "none"}, {"act_cond": False}])
+def test_models_without_latents_or_actions_have_an_objective_too(make_model, source, options, config):
+    model = make_model(**config)
+    inputs = inputs_of(model, source.at(source.spread(2, 4), 4))
+    inference = inference_network(model) if model.latent_channels else None
+    total, terms = objective(model, inference, inputs, options)
+    assert ("kl" in terms) == (inference is not None)
+    other, _ = objective(model, inference, replace(inputs, actions=inputs.actions + 1), options)
+    assert (total == other) == (not model.config.act_cond)
 
 
 @pytest.fixture
@@ -155,7 +194,7 @@ def test_replayed_steps_train_as_launched_ones(train, precision):
     replayed, ours = train("replayed", precision=precision)
     launched, theirs = train("launched", precision=precision, cuda_graphs=False)
     assert len(replayed._compute._recordings) == 4 and not replayed._compute._failed
-    assert launched._compute == launched._differentiate
+    assert launched._compute == launched.differentiate
     assert ours[0] == pytest.approx(theirs[0], rel=1e-3)
     assert ours == pytest.approx(theirs, rel=3e-2)
 

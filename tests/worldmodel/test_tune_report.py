@@ -72,6 +72,14 @@ def markdown_of(out):
     return (out / "report.md").read_text()
 
 
+def test_it_says_what_else_a_run_with_the_best_configuration_would_share(out):
+    line = "`best.json` also has what --config gave all trials, for a run of their kind: frame_gap 2, losses"
+    assert f'{line} {{"knn_radius": 3}}.' in markdown_of(out)
+    settings = json.loads((out / "tune.json").read_text())
+    (out / "tune.json").write_text(json.dumps(settings | {"shared": {"preset": "tiny", "model": "t3vip"}}))
+    assert "--config" not in markdown_of(out)
+
+
 def test_rank_correlations_are_spearmans_with_counts(out):
     document = report(out)
     unpruned = {tuple(pair["budgets"]): pair for pair in document["rank_correlation"]["unpruned"]}

@@ -90,14 +90,14 @@ def test_a_trial_is_deterministic_where_that_is_asked_for(begin):
 
 
 def test_a_loss_that_is_no_number_makes_a_bad_trial(begin, monkeypatch):
-    objective = training.Trainer.objective
+    objective = training.objective
 
-    def spoiled(self, clips):
-        total, terms = objective(self, clips)
-        return total * math.nan, {name: math.nan for name in terms}
+    def spoiled(*arguments):
+        total, terms = objective(*arguments)
+        return total * math.nan, {name: value * math.nan for name, value in terms.items()}
 
     monkeypatch.setattr(training, "MAX_BAD_STEPS", 2)
-    monkeypatch.setattr(training.Trainer, "objective", spoiled)
+    monkeypatch.setattr(training, "objective", spoiled)
     (told,) = begin()
     assert told["diverged"] and told["score"] == trials.WORST_DB and "not finite" in told["reason"]
 

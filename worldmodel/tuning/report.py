@@ -73,6 +73,7 @@ def summarise(settings: Document, trials: list[Trial]) -> Document:
         "budgets": budgets,
         "axes": settings["axes"],
         "around": settings["options"].get("around"),
+        "shared": {name: value for name, value in settings["shared"].items() if name not in ("preset", "model")},
         "asked": settings["options"]["trials"],
         "searcher": settings["options"]["searcher"],
         "trials": [
@@ -126,6 +127,9 @@ def markdown(document: Document) -> str:
         lines += [f"{line}.", ""]
         if best["number"] != 0 and document["gain"] is not None:
             lines += _motion(best, trials[0], str(budgets[-1]))
+        if document["shared"]:
+            given = ", ".join(f"{name} {json.dumps(value)}" for name, value in document["shared"].items())
+            lines += [f"`best.json` also has what --config gave all trials, for a run of their kind: {given}.", ""]
     lines += _table(
         [
             *("trial", "status", *(f"at {budget}" for budget in budgets)),

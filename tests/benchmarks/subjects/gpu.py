@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import contextlib
-import time
-from dataclasses import replace
+import gc
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from envs.errors import UsageError
-from tests.benchmarks.subjects.training import make_trainer
+from tests.benchmarks.subjects.scaling import sized_trainer
+from tests.benchmarks.timing import median_seconds
 from worldmodel.devices import prepare_devices
-from worldmodel.options import PRESETS
 
 Point = dict[str, Any]
 PEAK_SIZE = 8192
 COPIED = 2**30  # bytes
 
 
-def peaks(repeats: int) -> dict[str, float]:
-    """What the GPU can do: TFLOP/s of a square matrix product by precision, GB/s read and written by a copy."""
-    _needs_gpu()
-    found: dict[str, float] = {"name": torch.cuda.get_device_name()}  # type: ignore[dict-item]
+def peaks(repeats: int) -> dict[str, Any]:
+    """Name of the GPU and what it can do: TFLOP/s of a large matrix product by precision, GB/s (both ways) of a copy.
+
+    In float32 the product may use TF32, as PyTorch lets convolutions do.
+    """
+    torch.backends.cuda.matmul.allow_tf32 = True
+    found: dict[str, Any] = {"name": torch.cuda.get_device_name()}
     for precision in ("float32", "bfloat16"):
         left, right = torch.randn((2, PEAK_SIZE, PEAK_SIZE), device="cuda").to(getattr(torch, precision))
         found[precision] = 2e-12 * PEAK_SIZE**3 / _seconds(lambda a=left, b=right: a @ b, repeats)  # type: ignore[misc]
@@ -42,56 +44,35 @@ def steps(points: list[Point], repeats: int) -> list[Point]:
         repeats: steps that are timed.
 
     Returns:
-        Each point with `seconds`, `gflop` of a step and `gib`, the most memory that was reserved.
+        Each point with `seconds`, those of the `first` step, `gflop` of a step and `gib`, the most memory reserved.
     """
-    _needs_gpu()
     prepare_devices(deterministic=False)
     return [point | _step(point, repeats) for point in points]
 
 
 def _step(point: Point, repeats: int) -> Point:
     torch.compiler.reset()  # or the sizes before count as recompilations
+    gc.collect()
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
-    options = PRESETS[point["preset"]]
-    trainer = make_trainer(
-        "ours",
-        point["preset"],
-        "cuda",
-        batch=point["batch"],
-        schedule=replace(options.schedule, clip_lengths=((1.0, point["frames"]),)),
-        architecture=replace(options.architecture, width=point["width"]),
-        precision=point["precision"],
-        cuda_graphs=point["graphs"],
-    )
-    trainer.model.train()
+    sizes = {name: point[name] for name in ("preset", "batch", "width", "frames", "precision")}
+    trainer = sized_trainer(**sizes, device="cuda", cuda_graphs=point["graphs"])
     clips = trainer.next_clips()
-    how = contextlib.nullcontext() if point["compiled"] else torch.compiler.set_stance("force_eager")
-    with how:
-        begun = time.perf_counter()
-        trainer.update(clips)
-        torch.cuda.synchronize()
-        first = time.perf_counter() - begun
+    with contextlib.nullcontext() if point["compiled"] else torch.compiler.set_stance("force_eager"):
+        first = _seconds(lambda: trainer.update(clips), 1, warmup=0)
         seconds = _seconds(lambda: trainer.update(clips), repeats)
     gib = torch.cuda.max_memory_reserved() / 2**30
     with torch.compiler.set_stance("force_eager"), FlopCounterMode(display=False) as flops:
-        trainer._differentiate(trainer.inputs(clips))
+        trainer.differentiate(trainer.inputs(clips))
     return {"seconds": seconds, "first": first, "gflop": 1e-9 * flops.get_total_flops(), "gib": gib}
 
 
-def _seconds(work: Any, repeats: int) -> float:
-    """Median seconds of a call and all that it makes the GPU do."""
-    times = []
-    work()
-    for _ in range(repeats):
-        torch.cuda.synchronize()
-        start = time.perf_counter()
+def _seconds(work: Callable[[], Any], repeats: int, warmup: int = 1) -> float:
+    """Median seconds of a call and of all that it makes the GPU do."""
+
+    def whole() -> None:
         work()
         torch.cuda.synchronize()
-        times.append(time.perf_counter() - start)
-    return sorted(times)[len(times) // 2]
 
-
-def _needs_gpu() -> None:
-    if not torch.cuda.is_available():
-        raise UsageError("no GPU that PyTorch can use is here, and this measures one")
+    torch.cuda.synchronize()
+    return median_seconds(whole, repeats, warmup)

@@ -46,7 +46,7 @@ pixel above all, is `other`."""
 def step(preset: str, batch: int, width: float, frames: int, precision: str, repeats: int) -> dict[str, float]:
     """A step of training: median seconds, and of an eager step GFLOP, GB moved by convolutions and matrix products
     alone, and GB moved by all operators."""
-    trainer = _trainer(preset, batch, width, frames, precision)
+    trainer = sized_trainer(preset, batch, width, frames, precision)
     clips = trainer.next_clips()
     seconds = median_seconds(lambda: trainer.update(clips), repeats)
     with torch.compiler.set_stance("force_eager"):
@@ -64,7 +64,7 @@ def step(preset: str, batch: int, width: float, frames: int, precision: str, rep
 
 def shares(preset: str, batch: int, width: float, frames: int, precision: str, repeats: int) -> dict[str, float]:
     """Where the time of a step goes: shares of the operators' own CPU time that add up to 1."""
-    trainer = _trainer(preset, batch, width, frames, precision)
+    trainer = sized_trainer(preset, batch, width, frames, precision)
     clips = trainer.next_clips()
     trainer.update(clips)
     with profile(activities=[ProfilerActivity.CPU]) as profiled:
@@ -109,12 +109,13 @@ class Traffic(TorchDispatchMode):
         return out
 
 
-def _trainer(preset: str, batch: int, width: float, frames: int, precision: str) -> Trainer:
+def sized_trainer(preset: str, batch: int, width: float, frames: int, precision: str, **more: Any) -> Trainer:
+    """Our trainer late in a run of these sizes."""
     options = PRESETS[preset]
     schedule = replace(options.schedule, clip_lengths=((1.0, frames),))
     architecture = replace(options.architecture, width=width)
     trainer = make_trainer(
-        "ours", preset, batch=batch, schedule=schedule, architecture=architecture, precision=precision
+        "ours", preset, batch=batch, schedule=schedule, architecture=architecture, precision=precision, **more
     )
     trainer.model.train()
     return trainer
