@@ -51,6 +51,7 @@ def unroll(
     memory = model.blank_memory(rgb)
     predictions: list[Prediction] = []
     inputs = []
+    always, never = (False, False) if isinstance(truth, Tensor) else (truth >= 1, truth <= 0)
     with model.lending():
         for t in range(clips.actions.shape[1]):
             inputs.append(rgb)
@@ -58,7 +59,6 @@ def unroll(
             prediction, memory = model.predict(rgb, depth, clips.actions[:, t], latent, memory, still=still)
             predictions.append(prediction)
             predicted_depth = depth if prediction.depth is None else prediction.depth
-            always, never = (False, False) if isinstance(truth, Tensor) else (truth >= 1, truth <= 0)
             if t + 1 < context or always:
                 rgb, depth = clips.rgb[:, t + 1], clips.depth[:, t + 1]
             elif never:

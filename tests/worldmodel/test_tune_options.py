@@ -278,6 +278,12 @@ def test_a_folder_holds_one_search(tune_with, tmp_path):
     config.write_text('{"losses": {"kl": 0.5, "knn": 0.1}, "frame_gap": 2}')
     every = ("losses.knn = 0.018, not 0.1; losses.kl = 0.1, not 0.5", "frame_gap = 3, not 2")
     assert_one_line(tune_with("--trials", 2, "--config", config), *every)
+    config.write_text('{"save_every": 3}')
+    assert tune_with("--trials", 2, "--config", config)[0] == 130  # how, not what
+    settings = json.loads((tune_with.out / "tune.json").read_text())
+    del settings["training"]["cuda_graphs"]  # as a search that was begun before there was such an option
+    (tune_with.out / "tune.json").write_text(json.dumps(settings))
+    assert tune_with("--trials", 2)[0] == 130
     (tune_with.out / "tune.json").write_text("{")
     assert_one_line(tune_with("--trials", 2), "tune.json", "is damaged")
     other = tmp_path / "other"

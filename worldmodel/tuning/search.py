@@ -12,7 +12,7 @@ from data_collection.files import write_json
 from data_collection.ray_cluster import connect
 from envs.errors import UsageError
 from worldmodel.clips import ClipSource
-from worldmodel.train import changes, document_of
+from worldmodel.train import HOW_NOT_WHAT, changes, document_of
 from worldmodel.training_data import open_data, settled
 from worldmodel.tuning import journal
 from worldmodel.tuning.options import TuneOptions
@@ -61,8 +61,9 @@ def settle(options: TuneOptions) -> Data:
         same_ranges = before["axes"] == document["axes"]
         if more and same_ranges:
             before["options"]["trials"] = options.trials
-        groups = ("options", "training", "data")
-        found = next(filter(None, (changes(before[group], document[group]) for group in groups)), [])
+        what = {name: value for name, value in document["training"].items() if name not in HOW_NOT_WHAT}
+        groups = {"options": document["options"], "training": what, "data": document["data"]}
+        found = next(filter(None, (changes(before[name], now) for name, now in groups.items())), [])
         if not found and not same_ranges:  # those of an older version: configurations would be drawn anew
             found.append(f"ranges {before['axes']}, not {document['axes']}")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
