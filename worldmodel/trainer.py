@@ -182,7 +182,7 @@ class Trainer:
 
     def _numbers(self, terms: dict[str, Tensor]) -> dict[str, float]:
         """Terms as numbers, the means over all ranks: every term is a mean over equally many pixels of each clip."""
-        values = self.ranks.mean(torch.stack(list(terms.values())).detach()).tolist()
+        values = self.ranks.mean(torch.stack(list(terms.values()))).tolist()
         return dict(zip(terms, values, strict=True))
 
     def inputs(self, clips: Clips) -> StepInputs:

@@ -20,6 +20,22 @@ SIZES: dict[str, tuple[Any, ...]] = {
     "precision": ("bfloat16", "float32"),
 }
 """What is varied, one at a time, about the `cpu` preset at the end of its curriculum."""
+GPU_CHANGES: tuple[Point, ...] = (
+    {},
+    {"compiled": False},
+    {"graphs": False},
+    {"graphs": False, "compiled": False},
+    {"precision": "float32"},
+    {"batch": 4},
+    {"batch": 64},
+    {"frames": 4},
+    {"width": 1.0},
+    {"width": 1.0, "preset": "paper"},
+)
+"""What differs, on a GPU, from the same, replayed and compiled."""
+GPU_PEAKS = (("float32", "TFLOP/s"), ("bfloat16", "TFLOP/s"), ("copy", "GB/s"))
+HELD_S = 0.1
+"""How long an action of the servo is held."""
 
 
 def scaling(quick: bool) -> list[Result]:
@@ -82,7 +98,9 @@ def gpu(quick: bool) -> list[Result]:
     base = _base("tiny" if quick else "cpu") | {"preset": "cpu", "precision": "bfloat16"}
     base |= {"graphs": True, "compiled": True}
     points = [base | change for change in GPU_CHANGES[: 2 if quick else None]]
-    results = [Result(f"peak_{name}", peaks[name], unit, f"what {peaks['name']} can do", 1.0) for name, unit in PEAKS]
+    results = [
+        Result(f"peak_{name}", peaks[name], unit, f"what {peaks['name']} can do", 1.0) for name, unit in GPU_PEAKS
+    ]
     for found in measure("gpu.steps", points=points, repeats=repeats):
         floor = 1e-3 * found["gflop"] / peaks[found["precision"]]
         what = (
@@ -98,19 +116,4 @@ def gpu(quick: bool) -> list[Result]:
     return results
 
 
-HELD_S = 0.1
-PEAKS = (("float32", "TFLOP/s"), ("bfloat16", "TFLOP/s"), ("copy", "GB/s"))
-GPU_CHANGES: tuple[Point, ...] = (
-    {},
-    {"compiled": False},
-    {"graphs": False},
-    {"graphs": False, "compiled": False},
-    {"precision": "float32"},
-    {"batch": 4},
-    {"batch": 64},
-    {"frames": 4},
-    {"width": 1.0},
-    {"width": 1.0, "preset": "paper"},
-)
-"""What differs from the `cpu` preset at the end of its curriculum, replayed and compiled."""
 SERIES: dict[str, Callable[[bool], list[Result]]] = {"scaling": scaling, "gpu": gpu}
