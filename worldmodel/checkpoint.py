@@ -18,6 +18,7 @@ of a step comes from the run's seed and the step's number: there is no generator
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -178,6 +179,17 @@ def load_origin(name: str | Path) -> dict[str, Any]:
     """
     origin: dict[str, Any] = json.loads((find_model(name) / CONFIG).read_text()).get("origin", {})
     return origin
+
+
+def content_hashes(name: str | Path) -> dict[str, str]:
+    """SHA-256 of each of a model's files, by which one knows whether it is still the same.
+
+    Args:
+        name: see `find_model`.
+    """
+    folder = find_model(name)
+    files = (folder / file for file in (CONFIG, WEIGHTS, INFERENCE))
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files if path.is_file()}
 
 
 def save_training(

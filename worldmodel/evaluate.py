@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,11 +11,11 @@ import tyro
 from tqdm import tqdm
 
 from data_collection.dataset import RGBDDataset
-from data_collection.files import write_json, written_aside
+from data_collection.files import locked, write_json, written_aside
 from envs import command as command_line
 from envs.errors import UsageError
 from worldmodel import evaluation_report as report
-from worldmodel.checkpoint import load_inference, load_model, load_origin
+from worldmodel.checkpoint import content_hashes, load_inference, load_model, load_origin
 from worldmodel.clips import ClipSource
 from worldmodel.devices import best_precision, find_device
 from worldmodel.evaluation_table import EvaluationTable
@@ -25,6 +26,7 @@ from worldmodel.perceptual import SMALLEST, PerceptualNetwork
 from worldmodel.perceptual_weights import WeightsUnavailable, load_weights
 from worldmodel.sampling import Selection
 from worldmodel.scores import RESAMPLES
+from worldmodel.shelf import Shelf
 from worldmodel.validation import ValidationSet
 from worldmodel.world_model import WorldModel
 
@@ -97,19 +99,25 @@ def main(options: EvaluationOptions) -> None:
     sampling = Sampling(options.samples, select, options.seed) if options.samples else None
     table = EvaluationTable(sets, sampling, options.seed)
     document = _document(options, dataset, sets, select, remarks + notes)
-    with tqdm(total=sum(map(_count, [*sets.values(), *(sets[gap] for gap in gaps.values())])), unit="clip") as bar:
+    kept = options.out / "measured"
+    total = sum(map(_count, [*sets.values(), *(sets[gap] for gap in gaps.values())]))
+    with locked(options.out), tqdm(total=total, unit="clip") as bar:
         for gap, data in sets.items():
             bar.set_description("copy")
-            table.add_copy(gap, measure_copy(data, networks, bar.update))
+            shelf = Shelf(kept, _subject(options, dataset, gap, networks))
+            table.add_copy(gap, measure_copy(data, networks, bar.update, shelf))
         for name, model in models.items():
             bar.set_description(name)
             data, inference = sets[gaps[name]], load_inference(name, model)
             data = replace(data, source=data.source.with_actions(model.context.action_column))
-            measured = measure_model(model, data, networks, sampling, inference, options.without_motion, bar.update)
+            shelf = Shelf(kept, _subject(options, dataset, gaps[name], networks, name))
+            still = options.without_motion
+            measured = measure_model(model, data, networks, sampling, inference, still, bar.update, shelf)
             entry = table.add_model(name, gaps[name], measured, stochastic=bool(model.latent_channels))
             bar.write(report.line(name, entry))
             document["models"] = table.entries
             _write(options.out, document)
+        shutil.rmtree(kept)
     print(f"\n{report.markdown(document)}")
     for file in ("evaluation.json", "evaluation.md", "curves.png"):
         print(options.out / file)
@@ -139,6 +147,22 @@ def _clip_sets(dataset: RGBDDataset, gaps: list[int], options: EvaluationOptions
 
 def _count(data: ValidationSet) -> int:
     return len(data.source.spread(data.clips, data.frames))
+
+
+def _subject(
+    options: EvaluationOptions, dataset: RGBDDataset, gap: int, networks: Networks | None, model: str | None = None
+) -> dict[str, Any]:
+    """What the measurements of a batch depend on; without a model, those of copying."""
+    subject = {
+        "data": dataset.content_hash,
+        "frame_gap": gap,
+        "vgg": networks is not None,
+        **{name: getattr(options, name) for name in ("clips", "predicted", "context", "batch", "device")},
+    }
+    if model is not None:
+        subject["model"] = content_hashes(model)
+        subject |= {name: getattr(options, name) for name in ("samples", "select", "seed", "without_motion")}
+    return subject
 
 
 def _networks(options: EvaluationOptions, dataset: RGBDDataset) -> tuple[Networks | None, list[str]]:

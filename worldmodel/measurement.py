@@ -7,24 +7,28 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from worldmodel.clips import Clips, ClipTruth
 from worldmodel.inference import InferenceNetwork
-from worldmodel.latents import LatentUse
+from worldmodel.latents import infer_latents, latent_use
 from worldmodel.metrics import relative_depth_error, squared_error, ssim
 from worldmodel.motion_scores import motion_statistics, no_motion, predicted_motion, true_motion
 from worldmodel.perceptual import PerceptualNetwork
 from worldmodel.rollout import Rollout, unroll
 from worldmodel.sampling import Selection, best_future, draw_latents, predict_futures
 from worldmodel.scores import Statistics, join
+from worldmodel.shelf import NOTHING_KEPT, Shelf
 from worldmodel.t3vip import T3VIP
 from worldmodel.validation import MIN_WAY_M, ValidationSet, track_tcp
 from worldmodel.world_model import WorldModel
 
 Tick = Callable[[int], Any]
 """Told how many more clips are done."""
+_LATENTS = "latents"
 
 
 @dataclass(frozen=True)
@@ -64,23 +68,29 @@ class Measured:
 
 
 @torch.inference_mode()
-def measure_copy(data: ValidationSet, networks: Networks | None, tick: Tick) -> Statistics:
+def measure_copy(data: ValidationSet, networks: Networks | None, tick: Tick, shelf: Shelf = NOTHING_KEPT) -> Statistics:
     """Copying the last context frame, in colour and depth; nothing moves."""
-    parts, c = [], data.context
-    for clips, starts in data.batches():
-        rgb, depth = clips.rgb[:, c - 1 : c].expand_as(clips.rgb[:, c:]), clips.depth[:, c - 1 : c]
-        statistics = _frames(rgb, depth.expand_as(clips.depth[:, c:]), clips, c, networks)
-        statistics["inpainted"] = torch.zeros_like(statistics["se"])
-        if data.source.dataset.has_ground_truth:
-            truth = data.source.truth_at(starts, data.frames)
-            moved = true_motion(data.source.dataset.camera, clips, truth, c)
-            statistics |= motion_statistics(no_motion(moved), moved, truth.hand[:, c - 1 :])
-            if truth.tcp is not None:
-                way = (truth.tcp[:, -1] - truth.tcp[:, c - 1]).norm(dim=1)
-                statistics |= _tracking(way, way)
-        parts.append(statistics)
+    parts = []
+    for number, (clips, starts) in enumerate(data.batches()):
+        found = shelf.find(number)
+        parts.append(found or shelf.put(number, _copied(data, clips, starts, networks)))
         tick(len(starts))
     return join(parts)
+
+
+def _copied(data: ValidationSet, clips: Clips, starts: NDArray[np.int64], networks: Networks | None) -> Statistics:
+    c = data.context
+    rgb, depth = clips.rgb[:, c - 1 : c].expand_as(clips.rgb[:, c:]), clips.depth[:, c - 1 : c]
+    statistics = _frames(rgb, depth.expand_as(clips.depth[:, c:]), clips, c, networks)
+    statistics["inpainted"] = torch.zeros_like(statistics["se"])
+    if data.source.dataset.has_ground_truth:
+        truth = data.source.truth_at(starts, data.frames)
+        moved = true_motion(data.source.dataset.camera, clips, truth, c)
+        statistics |= motion_statistics(no_motion(moved), moved, truth.hand[:, c - 1 :])
+        if truth.tcp is not None:
+            way = (truth.tcp[:, -1] - truth.tcp[:, c - 1]).norm(dim=1)
+            statistics |= _tracking(way, way)
+    return statistics
 
 
 @torch.inference_mode()
@@ -92,6 +102,7 @@ def measure_model(
     inference: InferenceNetwork | None = None,
     still: bool = False,
     tick: Tick = lambda clips: None,
+    shelf: Shelf = NOTHING_KEPT,
 ) -> Measured:
     """Free-running prediction after the context, and motion one step ahead of true frames.
 
@@ -103,32 +114,60 @@ def measure_model(
         inference: of the model, for the kind `posterior`: latents at the mean of q(z | clip).
         still: measure the kind `still` too: the same model with every transform the identity, or every kernel a copy.
         tick: told of progress.
+        shelf: where batches that were measured are kept and looked for; by default nowhere.
     """
-    parts: dict[str, list[Statistics]] = defaultdict(list)
-    use = LatentUse()
-    c = data.context
-    for clips, starts in data.batches():
-        clips = clips.to(model.device)
-        truth = data.source.truth_at(starts, data.frames) if data.source.dataset.has_ground_truth else None
-        for kind in ["zero"] + ["still"] * still:
-            free = unroll(model, clips, c, still=kind == "still")
-            statistics = _free(model, free, clips, c, networks)
-            if isinstance(model, T3VIP) and truth is not None:
-                if truth.tcp is not None:
-                    statistics |= _tracking(*track_tcp(model, clips, truth.tcp, free, c))
-                statistics |= _taught(model, data, clips, truth, kind == "still")
-            parts[kind].append(statistics)
-        if inference is not None:
-            mean = use.infer(model, inference, clips)
-            parts["posterior"].append(_free(model, unroll(model, clips, c, mean), clips, c, networks))
-        if sampling is not None and model.latent_channels:
-            for b, start in enumerate(starts.tolist()):
-                clip = Clips(clips.rgb[b : b + 1], clips.depth[b : b + 1], clips.actions[b : b + 1])
-                parts["best"].append(measure_best(model, clip, start, c, networks, sampling))
-                tick(1)
+    parts = []
+    for number, (clips, starts) in enumerate(data.batches()):
+        found = shelf.find(number)
+        if found is None:
+            measured = _predicted(model, data, clips, starts, networks, sampling, inference, still, tick)
+            found = shelf.put(number, {f"{k}/{n}": value for k, some in measured.items() for n, value in some.items()})
         else:
             tick(len(starts))
-    return Measured({kind: join(some) for kind, some in parts.items()}, use.summary() if inference else None)
+        parts.append(found)
+    kinds: dict[str, Statistics] = defaultdict(dict)
+    for name, values in join(parts).items():
+        kind, _, statistic = name.partition("/")
+        kinds[kind][statistic] = values
+    inferred = kinds.pop(_LATENTS, None)
+    return Measured(dict(kinds), latent_use(inferred) if inferred is not None else None)
+
+
+def _predicted(
+    model: WorldModel,
+    data: ValidationSet,
+    clips: Clips,
+    starts: NDArray[np.int64],
+    networks: Networks | None,
+    sampling: Sampling | None,
+    inference: InferenceNetwork | None,
+    still: bool,
+    tick: Tick,
+) -> dict[str, Statistics]:
+    """One batch of `measure_model`, by kind of prediction; and what its latents carry."""
+    clips, c = clips.to(model.device), data.context
+    truth = data.source.truth_at(starts, data.frames) if data.source.dataset.has_ground_truth else None
+    kinds: dict[str, Statistics] = {}
+    for kind in ["zero"] + ["still"] * still:
+        free = unroll(model, clips, c, still=kind == "still")
+        kinds[kind] = _free(model, free, clips, c, networks)
+        if isinstance(model, T3VIP) and truth is not None:
+            if truth.tcp is not None:
+                kinds[kind] |= _tracking(*track_tcp(model, clips, truth.tcp, free, c))
+            kinds[kind] |= _taught(model, data, clips, truth, kind == "still")
+    if inference is not None:
+        mean, kinds[_LATENTS] = infer_latents(model, inference, clips)
+        kinds["posterior"] = _free(model, unroll(model, clips, c, mean), clips, c, networks)
+    if sampling is None or not model.latent_channels:
+        tick(len(starts))
+        return kinds
+    best = []
+    for b, start in enumerate(starts.tolist()):
+        clip = Clips(clips.rgb[b : b + 1], clips.depth[b : b + 1], clips.actions[b : b + 1])
+        best.append(measure_best(model, clip, start, c, networks, sampling))
+        tick(1)
+    kinds["best"] = join(best)
+    return kinds
 
 
 def _frames(rgb: Tensor, depth: Tensor | None, clips: Clips, context: int, networks: Networks | None) -> Statistics:

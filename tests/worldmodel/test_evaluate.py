@@ -9,6 +9,7 @@ import torch
 from data_collection.dataset import RGBDDataset
 from envs.command import parse, run
 from worldmodel import evaluate as command
+from worldmodel import measurement
 from worldmodel.checkpoint import save_model
 from worldmodel.evaluate import EvaluationOptions, main
 from worldmodel.inference import inference_network
@@ -92,6 +93,61 @@ def test_best_of_samples_beside_latents_at_0_and_the_posterior(evaluate, make_mo
     assert (tmp_path / "out" / "curves.png").stat().st_size > 5000
     again = evaluate(*names, arguments=["--no-vgg", "--samples", 6, "--batch", 3])
     assert again["models"][names[1]]["psnr"] == pytest.approx(theirs["psnr"], abs=1e-3)
+
+
+@pytest.fixture
+def count_batches(monkeypatch):
+    """Counts the batches that are measured from here on; the one after `stop_after` is never done."""
+
+    def start(stop_after=None):
+        counts = []
+
+        def measure(*arguments):
+            if len(counts) == stop_after:
+                raise OSError("the machine is gone")
+            counts.append(1)
+            return predicted(*arguments)
+
+        monkeypatch.setattr(measurement, "_predicted", measure)
+        return counts
+
+    predicted = measurement._predicted
+    return start
+
+
+def test_a_killed_evaluation_goes_on_where_it_was(evaluate, make_model, tmp_path, count_batches):
+    model = make_model()
+    save_model(model, tmp_path / "model", {}, inference_network(model))
+    name, kept = str(tmp_path / "model"), tmp_path / "out" / "measured"
+    arguments = ["--no-vgg", "--samples", 2, "--batch", 1]
+
+    counts = count_batches()
+    whole = evaluate(name, arguments=arguments)
+    assert len(counts) == 3 and not kept.exists()
+
+    def die_after(batches):
+        count_batches(stop_after=batches)
+        with pytest.raises(OSError, match="gone"):
+            evaluate(name, arguments=arguments)
+        return sorted(kept.glob("*/*.safetensors"))
+
+    die_after(2)
+    counts = count_batches()
+    assert evaluate(name, arguments=arguments) == whole and len(counts) == 1 and not kept.exists()
+
+    for damaged in die_after(2):
+        damaged.write_bytes(damaged.read_bytes()[:100])
+    counts = count_batches()
+    assert evaluate(name, arguments=arguments) == whole and len(counts) == 3
+
+    die_after(2)
+    save_model(make_model(masks=3), tmp_path / "model", {}, inference_network(model))
+    counts = count_batches()
+    assert evaluate(name, arguments=arguments) != whole and len(counts) == 3, "another model"
+    die_after(2)
+    counts = count_batches()
+    evaluate(name, arguments=[*arguments, "--seed", 1])
+    assert len(counts) == 3, "other latents"
 
 
 def test_vgg_scores_and_the_choice_by_them(evaluate, model_folder, monkeypatch, random_vgg):

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-from pathlib import Path
 from typing import Any
 
 from data_collection.dataset import RGBDDataset
 from data_collection.files import write_json
 from envs.errors import UsageError
 from worldmodel import evaluate
-from worldmodel.checkpoint import CONFIG, WEIGHTS, find_model
+from worldmodel.checkpoint import content_hashes
 from worldmodel.scores import PICTURE_SCORES
 from worldmodel.study.options import StudyOptions
 from worldmodel.study.plan import Contestant
@@ -102,10 +100,9 @@ def _whole(curve: list[float | None] | None, horizon: int) -> bool:
 
 def _protocol(options: StudyOptions, contestant: Contestant) -> dict[str, Any]:
     """What the scores depend on."""
-    model = find_model(folder_of(options, contestant))
     return {
         "test": RGBDDataset(options.test).content_hash,
-        "model": {name: _hash(model / name) for name in (CONFIG, WEIGHTS)},
+        "model": content_hashes(folder_of(options, contestant)),
         "predicted": options.averaged[-1],
         "context": CONTEXT,
         "clips": options.clips,
@@ -114,7 +111,3 @@ def _protocol(options: StudyOptions, contestant: Contestant) -> dict[str, Any]:
         "vgg": options.vgg,
         "seed": options.seed,
     }
-
-
-def _hash(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
