@@ -68,8 +68,8 @@ class EvaluationOptions:
     """Clips at a time."""
     seed: int = 0
     """Of the latents and of the resampling that gives the intervals."""
-    device: str = "cpu"
-    """Where the models run: cpu, cuda, or auto."""
+    device: str = "auto"
+    """Where the models run: cpu, cuda, or auto for a GPU where there is one."""
 
     def __post_init__(self) -> None:
         for name in ("clips", "predicted", "context", "batch"):
@@ -81,6 +81,9 @@ class EvaluationOptions:
             raise UsageError(f"--samples is {self.samples}; give 0 for latents at 0 only, or for example 100")
         if not self.models:
             raise UsageError("--models is empty; name at least one")
+        for name in self.models:
+            if name == "copy" or name.startswith("copy at gap "):
+                raise UsageError(f"--models {name} would go by the name of copying the last frame; give ./{name}")
 
 
 def main(options: EvaluationOptions) -> None:

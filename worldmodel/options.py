@@ -145,6 +145,12 @@ class TrainOptions:
         for name in ("colour_jitter", "seed"):
             if not getattr(self, name) >= 0:
                 raise UsageError(f"{name.replace('_', '-')} is {getattr(self, name)}; give 0 or more")
+        taught = ("rgb", "depth", "knn") if self.model.startswith("t3vip") else ("rgb",)
+        if not any(getattr(self.losses, name) for name in taught):
+            raise UsageError(
+                f"loss weights of 0 for {', '.join(taught)} leave {self.model} nothing to learn from; give one of them "
+                "more"
+            )
         shortest = min(frames for _, frames in self.schedule.clip_lengths)
         if not 1 <= self.context < shortest:
             raise UsageError(

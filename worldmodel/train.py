@@ -168,6 +168,10 @@ def _preset(arguments: Sequence[str]) -> TrainOptions:
     """The options that hold where the command line is silent: those of its preset, changed by its --config."""
     path = _given(arguments, "--config")
     values = {} if path is None else read_config(Path(path))
+    if _given(arguments, "--steps") is not None:  # they take the file's time's place
+        if _given(arguments, "--minutes") not in (None, "None"):
+            raise UsageError("--steps and --minutes are both given; give one of them")
+        values.pop("minutes", None)
     name = _given(arguments, "--preset") or values.pop("preset", "cpu")
     if not isinstance(name, str) or name not in PRESETS:
         raise UsageError(f"no preset '{name}'; there are {', '.join(PRESETS)}")

@@ -137,6 +137,8 @@ class Trainer:
             journal.close()
         if signal.SIGINT in stops:
             raise KeyboardInterrupt
+        if self.step < options.steps:
+            raise SystemExit(128 + signal.SIGTERM)  # the usual exit code of who was asked to stop
 
     def update(self, clips: Clips) -> dict[str, float]:
         """One step of Adam on a batch of clips; returns the terms of the loss.

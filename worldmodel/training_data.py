@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from data_collection.dataset import RGBDDataset
+from data_collection.overlap import shared_episodes
 from envs.errors import UsageError
 from envs.planar_push.objects import SPLITS, canonical
 from worldmodel.clips import HELD, ClipSource, usual_column
@@ -55,6 +56,7 @@ def open_data(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
     if options.validation is not None:
         held_out = RGBDDataset(options.validation)
         _same_world(dataset, held_out, column)
+        check_apart(dataset, held_out)
         train = ClipSource(dataset, options.frame_gap, action_column=column, memory_limit=limit)
         limit -= dataset.size_of(HELD) if train.in_memory else 0
         other = ClipSource(held_out, options.frame_gap, action_column=column, memory_limit=limit)
@@ -70,6 +72,19 @@ def open_data(options: TrainOptions) -> tuple[ClipSource, ValidationSet]:
     for clips in (train, other):
         clips.starts(frames)  # now, not hours later, when the curriculum gets there
     return train, ValidationSet(other, options.validation_clips, frames, options.context, options.batch)
+
+
+def check_apart(train: RGBDDataset, other: RGBDDataset) -> None:
+    """See that a model is not judged by what it was trained on.
+
+    Raises:
+        UsageError: datasets share episodes.
+    """
+    if shared := shared_episodes(train, other):
+        raise UsageError(
+            f"{len(shared)} of the {other.episodes} episodes of {other.path} (the first is number {shared[0]}) are in "
+            f"{train.path}, too, and say nothing about what a model has not seen; collect with another --seed"
+        )
 
 
 def _memory_limit(options: TrainOptions) -> float:

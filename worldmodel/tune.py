@@ -19,7 +19,7 @@ def main(options: TuneOptions) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     with locked(options.out):
         data = [settle(options)]
-        if unfinished(options):
+        if unfinished(options, retried=True):
             search(options, data.pop())  # to hand it over, not to keep a second copy
         stopped = unfinished(options)
         write_report(options.out)

@@ -64,8 +64,8 @@ class ViewOptions:
     """How many times each picture is enlarged; when not given, until it is 128 pixels wide."""
     speed: float = 0.5
     """Of the film; 1 is real time."""
-    device: str = "cpu"
-    """Where the models run: cpu, cuda, or auto."""
+    device: str = "auto"
+    """Where the models run: cpu, cuda, or auto for a GPU where there is one."""
 
     def __post_init__(self) -> None:
         least = {

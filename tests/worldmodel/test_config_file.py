@@ -40,6 +40,16 @@ def test_the_file_changes_the_preset_and_the_command_line_changes_both(options_w
     assert options.architecture == PRESETS["cpu"].architecture
 
 
+def test_steps_take_the_place_of_the_files_minutes(options_with):
+    file = {"minutes": 5, "steps": 3}
+    assert (options_with(file).minutes, options_with(file, "--minutes", "7").minutes) == (5.0, 7.0)
+    options = options_with(file, "--steps", "4")
+    assert (options.minutes, options.steps) == (None, 4)
+    assert options_with(file, "--steps", "4", "--minutes", "None").steps == 4
+    with pytest.raises(UsageError, match="--steps and --minutes are both given"):
+        options_with(file, "--steps=4", "--minutes=7")
+
+
 def test_the_config_of_a_run_makes_the_same_run(options_with):
     ours = parse_options(["--data", "d", "--out", "o", "--model", "sv2p", "--batch", "3", "--validation", "v"])
     again = options_with(document_of(ours))

@@ -165,7 +165,7 @@ def test_what_cannot_be_is_said_before_the_first_training(study, arguments, word
 def test_test_data_is_never_trained_on(study, data):
     for part in ("train", "validation"):
         code, err, trained = study("--steps", 1, **{part: data / "test"})
-        assert code == 2 and not trained and "is the test data" in err
+        assert code == 2 and not trained and f"4 of the 4 episodes of {data / 'test'}" in err
 
 
 @pytest.fixture
@@ -293,6 +293,13 @@ def test_a_study_that_is_killed_leaves_no_trainer_behind_and_goes_on_where_it_wa
     assert again.returncode == 0, err
     assert logged() == list(range(1, steps + 1))  # the trainer saved when its parent died: no step was done twice
     assert "trained: 40 steps" in printed and list(document(out)["models"]) == ["cdna-gap3"]
+
+
+def test_a_study_may_have_any_name(study, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    code, err, trained = study("--steps", 2, "--only", "cdna", "--gap", GAP, out="copy-of-a-table")
+    assert (code, trained) == (0, ["cdna-gap3"]), err
+    assert document(tmp_path / "copy-of-a-table")["models"]["cdna-gap3"]["training"]["steps"] == 2
 
 
 def test_a_config_file_changes_the_options_of_all_models(study, data, tmp_path):

@@ -124,6 +124,9 @@ def test_a_validation_set_of_its_own(train, write_dataset, tmp_path):
         (["--context", "4"], ["context is 4", "1 to 3"]),
         (["--losses.knn", "-1"], ["knn is -1.0", "give 0"]),
         (["--losses.rgb", "nan"], ["rgb is nan", "give 0"]),
+        (["--model", "cdna", "--losses.rgb", "0"], ["weights of 0 for rgb leave cdna nothing to learn from"]),
+        (["--losses.rgb", "0", "--losses.depth", "0", "--losses.knn", "0"], ["rgb, depth, knn", "t3vip"]),
+        (["--steps", "3", "--minutes", "1"], ["--steps and --minutes", "give one"]),
         (["--schedule.final-rate", "-2"], ["final-rate is -2.0", "from 0 to 1"]),
         (["--schedule.truth-until", "-1"], ["truth-until is -1.0", "0 or more"]),
         (["--schedule.kl-ramp", "0.6", "0.5"], ["kl-ramp is (0.6, 0.5)", "the earlier one first"]),
@@ -160,7 +163,7 @@ def test_datasets_that_are_not_whole(train, write_dataset, tmp_path, damage, wor
     assert_one_line(train(data=folder), str(folder), word)
 
 
-def test_data_that_does_not_do(train, write_dataset, camera_of, tmp_path):
+def test_data_that_does_not_do(train, tiny_dataset, write_dataset, camera_of, tmp_path):
     assert_one_line(train(data=tmp_path / "nowhere"), "nowhere", "collect-rollouts")
     test_scene = write_dataset(tmp_path / "d", [12, 12], env_id="t3vip/TabletopD-v0")
     assert_one_line(train(data=test_scene), "TabletopD-v0", "test scene")
@@ -181,6 +184,9 @@ def test_data_that_does_not_do(train, write_dataset, camera_of, tmp_path):
         assert_one_line(train("--validation", folder), str(folder), word)
     finer = write_dataset(tmp_path / "finer", [12], action_scale=[0.01] * 7)
     assert_one_line(train("--validation", finer), str(finer), "action scale (0.01,")
+    assert_one_line(train("--validation", tiny_dataset), "6 of the 6 episodes", "another --seed")
+    part = write_dataset(tmp_path / "part", [16, 20, 12])  # the same seed
+    assert_one_line(train("--validation", part), f"2 of the 3 episodes of {part} (the first is number 0)", "--seed")
     short = write_dataset(tmp_path / "short", [6])
     assert_one_line(train("--validation", short), "no episode is 10 frames long", "longest has 6")
     assert not (tmp_path / "run" / "metrics.jsonl").exists()
@@ -233,7 +239,7 @@ def assert_same(ours, theirs):
         assert torch.equal(value, theirs[name]), name
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_who_is_asked_to_stop_saves_and_the_same_command_goes_on(start, undisturbed, tmp_path, number, code):
     out = tmp_path / "run"
     process = start(out)

@@ -141,7 +141,8 @@ def test_a_dataset_may_go_by_several_names(tune_with, write_dataset, monkeypatch
     (tmp_path / "link").symlink_to(data)
     assert tune_with("--validation", "v", data="d")[0] == 130
     assert tune_with("--validation", "./v", data="link")[0] == 130
-    assert_one_line(tune_with("--validation", "d", data="d"), f"validation = {held_out}, not {data}")
+    other = write_dataset(tmp_path / "w", [16], seed=2)
+    assert_one_line(tune_with("--validation", "w", data="d"), f"validation = {held_out}, not {other}")
     assert_one_line(tune_with(data="d"), f"validation = {held_out}, not None")
 
 
@@ -226,6 +227,28 @@ def test_a_search_that_goes_on_remembers_its_rungs(tmp_path):
     assert tell(scheduler, 4, 1, 25.0) == CONTINUE
     assert tell(scheduler, 1, 1, 20.0) == STOP  # it had ended, and tells its scores again
     assert tell(scheduler, 2, 1, 30.0) == CONTINUE  # it had not
+    journal.append(results, {"kind": "begin", "trial": 1, "point": {"learning_rate": 2e-4}})  # and was killed then
+    scheduler = halving(results)
+    scheduler.on_trial_add(None, ray_trial(1))
+    assert tell(scheduler, 1, 1, 20.0) == STOP
+
+
+def test_trials_that_died_too_often_are_tried_again(tune_with, monkeypatch):
+    searched = []
+    monkeypatch.setattr(tune, "search", lambda options, data: searched.append(options.retries))
+    assert tune_with("--trials", 2)[0] == 130
+    results = tune_with.out / journal.JOURNAL
+    for number, status in enumerate(("finished", "failed")):
+        point = point_of(TINY, axes_of(TINY)) | {"rgb": 0.1 * (1 + number)}
+        journal.append(results, {"kind": "begin", "trial": number, "point": point})
+        journal.append(results, {"kind": "score", "trial": number, "step": TINY.steps, "score": 30.0})
+        journal.append(results, {"kind": "end", "trial": number, "status": status})
+    (tune_with.out / "ray").mkdir()
+    assert tune_with("--trials", 2)[0] == 0 and len(searched) == 2 and (tune_with.out / "ray").exists()
+    assert tune_with("--trials", 2, "--retries", 5)[0] == 0 and searched[-1] == 5
+    assert not (tune_with.out / "ray").exists()  # which keeps to 3
+    journal.append(results, {"kind": "end", "trial": 1, "status": "finished"})
+    assert tune_with("--trials", 2, "--retries", 5)[0] == 0 and len(searched) == 3
 
 
 @pytest.mark.parametrize(

@@ -107,3 +107,5 @@ def test_so_does_a_score_that_is_none(begin, monkeypatch):
     monkeypatch.setattr(training, "validate", lambda *arguments: validate(*arguments) | {"score": math.nan})
     (told,) = begin()
     assert told["diverged"] and told["step"] == 3 and "score" in told["reason"]
+    monkeypatch.setattr(training, "validate", validate)
+    assert steps_of(begin()) == [3, STEPS]  # taken up again, by a process that finds what the first one wrote

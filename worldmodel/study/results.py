@@ -50,7 +50,7 @@ def collect(options: StudyOptions) -> dict[str, Any]:
             missing.append(contestant.run)
             continue
         trained_on[contestant.run] = _same_data(options, contestant, trained_on)
-        (ours,) = (entry for name, entry in scores["models"].items() if not name.startswith("copy"))
+        (ours,) = (entry for name, entry in scores["models"].items() if name != "copy")
         models[contestant.run] = _entry(options, contestant, progress, ours, env_id)
         copied = scores["models"]["copy"]
         copies[str(contestant.gap)] = {

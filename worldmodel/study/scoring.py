@@ -14,6 +14,7 @@ from worldmodel.scores import PICTURE_SCORES
 from worldmodel.study.options import StudyOptions
 from worldmodel.study.plan import Contestant
 from worldmodel.study.training import folder_of
+from worldmodel.training_data import check_apart
 
 CONTEXT = 2
 """Frames that every model sees."""
@@ -24,12 +25,11 @@ def check_lengths(options: StudyOptions) -> None:
     """See before the first training that the test episodes are long enough to be scored on.
 
     Raises:
-        UsageError: they are not, or test data is training data.
+        UsageError: they are not, or some are training or validation episodes.
     """
     test = RGBDDataset(options.test)
     for path in (options.train, options.validation):
-        if RGBDDataset(path).content_hash == test.content_hash:
-            raise UsageError(f"{path} is the test data {options.test}; test on data that no model has seen")
+        check_apart(RGBDDataset(path), test)
     frames = CONTEXT + options.averaged[-1]
     span = max(c.gap for c in options.contestants) * (frames - 1) + 1
     if test.episode_lengths.max() < span:

@@ -61,7 +61,7 @@ class Halving(ASHAScheduler):
             for step in sorted(set(before.scores) & set(self._budgets[:-1])):
                 super().on_trial_result(nobody, known, {"step": step, self._metric: before.scores[step]})
             super().on_trial_remove(nobody, known)
-            if before.status not in ("running", "failed"):
+            if before.status in journal.ENDED:
                 ended[known.trial_id] = before.step
 
 

@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 Status = Literal["running", "finished", "stopped", "diverged", "failed"]
+ENDED: tuple[Status, ...] = ("finished", "stopped", "diverged")
+"""Of trials that no search takes any further; one that `failed` is tried again."""
 JOURNAL = "results.jsonl"
 PARTS = ("psnr", "depth_psnr", "flow_error_moving")
 """Told with a score: the two that it is the sum of, dB, and with ground truth the motion that it does not see."""
@@ -82,7 +84,8 @@ def trials(path: Path) -> list[Trial]:
         if kind == "begin":
             if line["point"] != trial.point:  # a search that lost its state drew anew
                 trial = known[trial.number] = Trial(trial.number, line["point"])
-            trial.status = "running"
+            if trial.status not in ENDED:  # else it only tells its scores again
+                trial.status = "running"
         elif kind == "score":
             step = int(line["step"])
             trial.scores[step] = float(line["score"])

@@ -42,6 +42,7 @@ def settle(options: TuneOptions) -> Data:
     data = open_data(training)
     document: dict[str, Any] = {
         "options": options.document(),
+        "retries": options.retries,
         "training": document_of(training),
         "shared": options.shared,
         "data": {"train": data[0].dataset.content_hash, "validation": data[1].source.dataset.content_hash},
@@ -57,13 +58,17 @@ def settle(options: TuneOptions) -> Data:
         return data
     try:
         before = json.loads(path.read_text())
-        more = options.trials > before["options"]["trials"] and options.searcher == "random"
+        repeatable = options.searcher == "random"
+        more = options.trials > before["options"]["trials"] and repeatable
         same_ranges = before["axes"] == document["axes"]
         if more and same_ranges:
             before["options"]["trials"] = options.trials
+        other_retries = before.get("retries", options.retries) != options.retries
         what = {name: value for name, value in document["training"].items() if name not in HOW_NOT_WHAT}
         groups = {"options": document["options"], "training": what, "data": document["data"]}
         found = next(filter(None, (changes(before[name], now) for name, now in groups.items())), [])
+        if other_retries and not repeatable:
+            found.append(f"retries = {before['retries']}, not {options.retries}")
         if not found and not same_ranges:  # those of an older version: configurations would be drawn anew
             found.append(f"ranges {before['axes']}, not {document['axes']}")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -73,16 +78,21 @@ def settle(options: TuneOptions) -> Data:
             f"{options.out} holds a search with {'; '.join(found)}; give the same options to go on with it, or another "
             "--out"
         )
-    if more:
+    if more or other_retries:
         if (options.out / RAY).exists():
-            shutil.rmtree(options.out / RAY)  # it knows of fewer; trials go on from their own folders
+            shutil.rmtree(options.out / RAY)  # it keeps to the old numbers; trials go on from their own folders
         write_json(path, document)
     return data
 
 
-def unfinished(options: TuneOptions) -> bool:
-    """Whether there are trials that have not come to their ends."""
-    ended = [trial for trial in journal.trials(options.out / journal.JOURNAL) if trial.status != "running"]
+def unfinished(options: TuneOptions, retried: bool = False) -> bool:
+    """Whether there are trials that have not come to their ends.
+
+    Args:
+        retried: count those that died too often among them.
+    """
+    done = journal.ENDED if retried else (*journal.ENDED, "failed")
+    ended = [trial for trial in journal.trials(options.out / journal.JOURNAL) if trial.status in done]
     return len(ended) < options.trials
 
 

@@ -85,7 +85,7 @@ def _validations(options: TrainOptions) -> list[dict[str, Any]]:
             line = json.loads(text)
         except ValueError:  # torn by a kill
             continue
-        if line.get("kind") == "validation" and math.isfinite(line["score"]):
+        if line.get("kind") == "validation" and line["score"] is not None:  # None: it was no number
             lines[line["step"]] = line
     return [lines[step] for step in sorted(lines)]
 

@@ -35,7 +35,7 @@ class Watcher(Callback):
     ) -> None:
         """The search begins or goes on."""
         self._before = {trial.number: trial for trial in journal.trials(self._results)}
-        ended = [trial for trial in self._before.values() if trial.status != "running"]
+        ended = [trial for trial in self._before.values() if trial.status in journal.ENDED]
         self._bar = tqdm(total=self._count, initial=len(ended), desc="tune", unit="trial", dynamic_ncols=True)
         for trial in self._before.values():
             self._see(trial.number, trial.step, trial.score)
@@ -86,7 +86,7 @@ class Watcher(Callback):
     def _end(self, trial: Any, status: Status, reason: str) -> None:
         number, step = _number(trial), trial.last_result.get("step", 0)
         before = self._before.get(number)
-        if before is not None and before.status not in ("running", "failed"):  # it only told its scores again
+        if before is not None and before.status in journal.ENDED:  # it only told its scores again
             status, reason = before.status, before.reason
         elif self._bar is not None:
             self._bar.update()
