@@ -46,8 +46,7 @@ class PixelController(LearnedController):
     def imagine(self, observation: Observation) -> CostFunction:
         state = self.observed()
         start = PixelTrack.start(self.distribution(self.designated[-1]), self.distribution(self.designated[0]))
-        # The point need be none of the pixels (the TCP is not), it keeps a constant offset from their mean. As the mean
-        # is to be that much beside the goal, the goal moves instead.
+        # The point need be none of the pixels (the TCP is not): it keeps a constant offset from their mean.
         offset = self.pixel(self.follower.point) - start.expected_position()[0]
         goal = self.tensor(self.goal.pixel)
         target = goal - offset
@@ -63,10 +62,14 @@ class PixelController(LearnedController):
                 last = step + 1 == actions.shape[1]  # nobody looks at its picture
                 future, prediction = self.model.step(future, actions[:, step], paint=False, picture=not last)
                 track = track.advance(prediction)
-                distance = track.expected_distance(target)
+                place = track.expected_position() + offset
                 if self.reach:
-                    place = track.expected_position() + offset
+                    distance = track.expected_distance(target)
                     distance = distance + self.reach.cost(effector[:, step], place, goal, per_metre)
+                else:
+                    # The hand's pixels lie lopsidedly about their mean: their expected distance is least where their
+                    # median is in its place, nearly a pixel from where the TCP is at its goal.
+                    distance = (place - goal).norm(dim=1)
                 distances.append(distance)
             return discounted_distance(torch.stack(distances, dim=1).cpu().numpy())
 

@@ -59,15 +59,17 @@ def test_does_not_know_how_far_away_the_goal_is(pixel_model, camera, world, goal
         np.testing.assert_array_equal(runs[0], other)
 
 
-def hand_beside(world, camera, du):
-    """Observations in which the hand shows to the side of the TCP only, by up to 5 pixels; the rest is far behind."""
+def hand_of(world, *boxes):
+    """Observations in which the hand shows in some boxes of pixels about the TCP's (rows, then columns, from and to)
+    and nowhere else; the rest is far behind."""
     seen = world.observation
 
     def observation():
         now = seen()
         u, v = np.rint(pixel_of(world)).astype(int)
         hand = np.zeros_like(now["depth"], bool)
-        hand[v - 2 : v + 3, min(u, u + du) : max(u, u + du) + 1] = True
+        for top, bottom, left, right in boxes:
+            hand[v + top : v + bottom + 1, u + left : u + right + 1] = True
         now["depth"] = np.where(hand, now["depth"], now["depth"] + 0.5).astype(np.float32)
         return now
 
@@ -75,13 +77,25 @@ def hand_beside(world, camera, du):
 
 
 def test_it_is_the_tcp_that_goes_to_the_pixel_not_the_hand(pixel_model, camera, world, goal):
-    world.observation = hand_beside(world, camera, -5)
+    world.observation = hand_of(world, (-2, 2, -5, 0))
     _, distances = servo(PixelController("sv2p", pixel_model, camera, planner()), world, goal)
     assert np.median(distances[-8:]) < 1.0  # the hand's mean is 2.5 pixels beside
 
 
+def test_at_the_goal_nothing_is_better_than_to_stay_however_the_hand_is_shaped(pixel_model, camera, world, goal):
+    world.observation = hand_of(world, (-2, 2, -2, -1), (0, 0, 0, 5))  # most of its pixels on one side, a thumb
+    controller = PixelController("sv2p", pixel_model, camera, planner())
+    observation = world.observation()
+    controller.reset(observation, dataclasses.replace(goal, pixel=pixel_of(world)))
+    controller.act(observation)
+    moves = 0.5 * np.random.default_rng(0).uniform(-1, 1, (50, 2, 3))
+    moves[0] = 0
+    costs = controller.imagine(observation)(moves)
+    assert costs[0] < 0.01 and costs.argmin() == 0
+
+
 def test_designated_are_the_pixels_of_the_hand_in_both_frames(pixel_model, camera, world, goal):
-    world.observation = hand_beside(world, camera, 5)
+    world.observation = hand_of(world, (-2, 2, 0, 5))
     controller = PixelController("sv2p", pixel_model, camera, planner())
     observation = world.observation()
     controller.reset(observation, goal)
@@ -105,8 +119,8 @@ def test_designated_are_the_pixels_of_the_hand_in_both_frames(pixel_model, camer
     grid = np.stack(np.meshgrid(np.arange(64), np.arange(64)), axis=-1)
     hand = np.array((now[..., None] * torch.from_numpy(grid)).sum((0, 1)))
     tcp = camera.project(camera.to_camera(np.float32(controller.frames[1]["proprio"][:3])))
-    far = np.linalg.norm(grid - (goal.pixel - tcp + hand), axis=-1)
-    np.testing.assert_allclose(costs, (1 + 0.95) * (before.numpy() * far).sum(), rtol=1e-4)
+    then = np.array((before[..., None] * torch.from_numpy(grid)).sum((0, 1)))
+    np.testing.assert_allclose(costs, (1 + 0.95) * np.linalg.norm(then + tcp - hand - goal.pixel), rtol=1e-4)
 
 
 def test_a_hand_lost_from_the_picture_costs_infinitely(pixel_model, camera, world, goal):
