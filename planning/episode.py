@@ -65,6 +65,7 @@ class Record:
 def run_episode(
     env: gym.Env,
     setup: Setup,
+    name: str,
     controller: Controller,
     steps: int,
     repeat: int = 0,
@@ -78,6 +79,7 @@ def run_episode(
     Args:
         env: where; the simulator is the judge, not shown to the controller.
         setup: where it starts and what the goal is.
+        name: what the record calls the controller.
         controller: sees observations and the goal.
         steps: budget of control steps.
         repeat: number of this attempt at the setup.
@@ -106,7 +108,7 @@ def run_episode(
         if min(hits_3d.min(), hits_2d.min()) >= HITS:
             break
     return Record(
-        model=controller.name,
+        model=name,
         setup=setup.index,
         repeat=repeat,
         steps=len(distances),

@@ -208,7 +208,7 @@ def run_missing(config: ServoConfig, env: gym.Env, studio: Studio, kit: Kit, log
             kit.rng = np.random.default_rng(np.random.SeedSequence(entropy))
             film = Film(studio, setup, name) if wants_film(config, index, repeat) else None
             record = run_episode(
-                env, setup, CONTROLLERS[name](kit), config.steps, repeat, film.watch if film is not None else None
+                env, setup, name, CONTROLLERS[name](kit), config.steps, repeat, film.watch if film is not None else None
             )
             if film is not None:
                 film.save(film_path(config.out / "videos", record))

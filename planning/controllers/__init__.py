@@ -24,7 +24,7 @@ def _pixel(name: str) -> Callable[[Kit], Controller]:
     return lambda kit: PixelController(name, kit.model(name), kit.camera, **kit.planning_parts())
 
 
-# A new controller is one line.
+# A new controller is one line; its results and films go by its name here.
 CONTROLLERS: dict[str, Callable[[Kit], Controller]] = {
     "t3vip": lambda kit: T3VIPController(kit.model("t3vip"), kit.camera, **kit.planning_parts()),
     **{name: _pixel(name) for name in PIXEL_MODELS},

@@ -20,7 +20,6 @@ __all__ = ["Controller", "Goal", "HoldingController", "Observation", "PlanningCo
 class Controller(Protocol):
     """Brings the designated point to a goal, one action per control step."""
 
-    name: str
     plan_seconds: list[float]
 
     def reset(self, observation: Observation, goal: Goal) -> None:
@@ -43,8 +42,6 @@ class HoldingController:
     Attributes:
         plan_seconds: wall time of each decision of the current episode.
     """
-
-    name = "holding"
 
     def __init__(self, hold: int, effector: Effector | None = None, follower: Follower | None = None) -> None:
         self.hold = hold

@@ -13,6 +13,7 @@ import pytest
 from envs.errors import UsageError
 from planning import servo_eval
 from planning.controllers import CONTROLLERS, Goal, Kit
+from planning.controllers.baselines import ProportionalController
 from planning.episode import THRESHOLDS, run_episode
 from planning.film import Film, Studio
 from planning.servo_eval import ServoConfig, command, main
@@ -52,7 +53,7 @@ def setup_of(env, index):
 def episode(env, name, index, steps):
     kit = Kit(env, rng=np.random.default_rng(index))
     try:
-        return run_episode(env, setup_of(env, index), CONTROLLERS[name](kit), steps)
+        return run_episode(env, setup_of(env, index), name, CONTROLLERS[name](kit), steps)
     finally:
         kit.close()
 
@@ -95,8 +96,8 @@ def test_pictures_do_not_know_the_goal(env):
             observations.append({key: np.array(value) for key, value in observation.items()})
             return inner.act(observation)
 
-        spy = SimpleNamespace(name="spy", plan_seconds=[0.0], reset=inner.reset, act=act)
-        run_episode(env, variant, spy, 6, watch=film.watch if film else None)
+        spy = SimpleNamespace(plan_seconds=[0.0], reset=inner.reset, act=act)
+        run_episode(env, variant, "spy", spy, 6, watch=film.watch if film else None)
         seen.append(observations)
     studio.close()
     for others in seen[1:]:
@@ -138,6 +139,23 @@ def test_command_writes_everything_and_resumes_episode_by_episode(tmp_path, run,
 
     code, _, err = run(*options, "--episodes", 2, "--seed", 1)
     assert code == 2 and "seed" in err and err.count("\n") == 1
+
+
+class Lazy(ProportionalController):
+    """One of the controllers there are, with a change."""
+
+    def decide(self, observation):
+        return 0 * super().decide(observation)
+
+
+def test_results_go_by_the_name_that_a_controller_is_asked_for_by(tmp_path, monkeypatch):
+    monkeypatch.setitem(CONTROLLERS, "lazy", lambda kit: Lazy(**kit.parts()))
+    for models in (("proportional",), ("proportional", "lazy"), ("proportional",)):
+        main(ServoConfig(out=tmp_path, model=models, episodes=1, steps=4, video=1))
+    lines = [json.loads(line) for line in (tmp_path / "episodes.jsonl").read_text().splitlines()]
+    assert [line["model"] for line in lines] == ["proportional", "lazy"]
+    assert lines[0]["final_distance"] < 0.9 * lines[1]["final_distance"]
+    assert {path.stem for path in (tmp_path / "videos").iterdir()} == {"proportional-setup00-0", "lazy-setup00-0"}
 
 
 def test_repeats_share_a_setup_but_not_their_randomness():

@@ -69,7 +69,7 @@ def planner() -> ICEM:
 
 def left(env, controller, index: int) -> float:
     """Least share of the way that was left at any time of a servo episode."""
-    record = run_episode(env, make_setup(env, index, seed=99), controller, steps=60)
+    record = run_episode(env, make_setup(env, index, seed=99), "any", controller, steps=60)
     return record.least_distance / record.initial_distance
 
 
@@ -95,8 +95,6 @@ def test_fails_when_action_channels_are_shuffled_before_the_model(env, model):
 class Witness:
     """Keeps what it is shown, and stands still."""
 
-    name = "witness"
-
     def __init__(self) -> None:
         self.plan_seconds = [0.0]
         self.shown: list[dict] = []
@@ -116,7 +114,7 @@ def test_neither_pictures_nor_scene_show_the_goal(env):
         point = setup.goal.point_world + shift
         goal = Goal(point, camera.project(camera.to_camera(point)))
         witnesses.append(Witness())
-        run_episode(env, replace(setup, goal=goal), witnesses[-1], steps=3)
+        run_episode(env, replace(setup, goal=goal), "witness", witnesses[-1], steps=3)
         things = np.concatenate([data.xpos, data.geom_xpos, data.site_xpos, data.light_xpos])
         assert np.linalg.norm(things - point, axis=1).min() > CLEARANCE
     for one, other in zip(*(witness.shown for witness in witnesses), strict=True):
