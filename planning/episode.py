@@ -40,7 +40,7 @@ class Record:
     final_pixel_distance: float
     least_distance: float
     plan_seconds: float
-    """median wall time of a decision"""
+    """median wall time of a decision; 0 where none was taken down"""
     distances: list[float]
     """after every control step"""
     limits: list[float] = field(default_factory=lambda: list(THRESHOLDS))
@@ -120,7 +120,7 @@ def run_episode(
         final_distance=distances[-1],
         final_pixel_distance=pixel_distance,
         least_distance=min(distances),
-        plan_seconds=median(controller.plan_seconds),
+        plan_seconds=median(controller.plan_seconds or [0.0]),
         distances=[round(d, 5) for d in distances],
         limits=list(limits),
         part=setup.part if isinstance(setup, PointSetup) else "",

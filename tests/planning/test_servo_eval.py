@@ -13,7 +13,9 @@ import pytest
 from envs.errors import UsageError
 from planning import servo_eval
 from planning.controllers import CONTROLLERS, Goal, Kit
+from planning.controllers.base import held_gripper
 from planning.controllers.baselines import ProportionalController
+from planning.costs import env_action
 from planning.episode import THRESHOLDS, run_episode
 from planning.film import Film, Studio
 from planning.servo_eval import ServoConfig, command, main
@@ -156,6 +158,26 @@ def test_results_go_by_the_name_that_a_controller_is_asked_for_by(tmp_path, monk
     assert [line["model"] for line in lines] == ["proportional", "lazy"]
     assert lines[0]["final_distance"] < 0.9 * lines[1]["final_distance"]
     assert {path.stem for path in (tmp_path / "videos").iterdir()} == {"proportional-setup00-0", "lazy-setup00-0"}
+
+
+class Still:
+    """All that a controller needs."""
+
+    def __init__(self):
+        self.plan_seconds = []
+
+    def reset(self, observation, goal):
+        self.gripper = held_gripper(observation)
+
+    def act(self, observation):
+        return env_action(np.zeros(3), self.gripper)
+
+
+def test_a_controller_need_not_take_down_how_long_it_decides(tmp_path, monkeypatch):
+    monkeypatch.setitem(CONTROLLERS, "still", lambda kit: Still())
+    main(ServoConfig(out=tmp_path, model=("still",), episodes=1, steps=2))
+    entry = json.loads((tmp_path / "servo.json").read_text())["models"]["still"]
+    assert entry["plan_seconds_median"] == 0 and entry["episodes"] == 1
 
 
 def test_repeats_share_a_setup_but_not_their_randomness():
