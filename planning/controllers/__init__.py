@@ -7,14 +7,12 @@ from collections.abc import Callable
 from planning.controllers.base import Controller, Goal
 from planning.controllers.baselines import LinearController, ProportionalController, RandomController
 from planning.controllers.kit import Kit
+from planning.controllers.learned import PIXEL_MODELS
 from planning.controllers.oracle import OracleController
 from planning.controllers.pixel import PixelController
 from planning.controllers.t3vip import T3VIPController
 
 __all__ = ["CONTROLLERS", "LEARNED", "PIXEL_MODELS", "Controller", "Goal", "Kit"]
-
-PIXEL_MODELS = ("sv2p", "sna", "cdna")
-"""The controllers that know their goal as a pixel."""
 
 LEARNED = ("t3vip", *PIXEL_MODELS)
 """The controllers that need a world model's weights."""

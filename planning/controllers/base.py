@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.errors import UsageError
 from planning.costs import Reach
 from planning.effectors import Arm, Effector, Observation, held_gripper
 from planning.followers import EffectorFollower, Follower
@@ -85,9 +86,12 @@ class PlanningController(HoldingController):
     A subclass says in `imagine` what a sequence of moves costs.
 
     Args:
-        planner: searches sequences of moves.
+        planner: searches sequences of moves, within the effector's limit.
         hold, effector, follower: see `HoldingController`.
         reach: draws the end-effector to the thing that the point is on, if given.
+
+    Raises:
+        UsageError: the planner's bounds are no moves of the effector.
     """
 
     def __init__(
@@ -99,6 +103,12 @@ class PlanningController(HoldingController):
         reach: Reach | None = None,
     ) -> None:
         super().__init__(hold, effector, follower)
+        axes, limit = self.effector.axes, self.effector.limit
+        if planner.low.shape != (axes,) or max(-planner.low.min(), planner.high.max()) > limit:
+            raise UsageError(
+                f"the planner searches from {planner.low.tolist()} to {planner.high.tolist()}, but a move of the"
+                f" {type(self.effector).__name__} is {axes} numbers from {-limit} to {limit}; give such low and high"
+            )
         self.planner, self.reach = planner, reach
 
     def reset(self, observation: Observation, goal: Goal) -> None:

@@ -17,6 +17,8 @@ from worldmodel.tracking import Track
 class T3VIPController(LearnedController):
     """Brings the point to its goal by the predicted motion, in space, of the pixels around it."""
 
+    kinds = ("t3vip",)
+
     def imagine(self, observation: Observation) -> CostFunction:
         foresee = self.foresight(observation)
         goal = self.in_camera(self.goal.point_world)

@@ -200,6 +200,22 @@ def test_bad_settings_are_named(options):
         ICEMConfig(**options)
 
 
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        (-1, 1),
+        (-np.ones((1, 3)), np.ones((1, 3))),
+        (-np.ones(2), HIGH),
+        (HIGH, LOW),
+        (LOW, [1, 1, -1]),
+        (LOW, HIGH * np.inf),
+    ],
+)
+def test_bounds_that_leave_nothing_to_search_are_refused(low, high):
+    with pytest.raises(UsageError, match=r"low is .*, high is .*; give"):
+        ICEM(ICEMConfig(), low, high, np.random.default_rng(0))
+
+
 def test_a_cost_of_the_wrong_shape_is_a_bug():
     with pytest.raises(ValueError, match="shape"):
         make().plan(lambda actions: np.zeros((len(actions), 1)))

@@ -27,7 +27,8 @@ class Shuffled(torch.nn.Module):
     def __init__(self, model) -> None:
         super().__init__()
         self.model = model
-        self.frame_gap, self.action_dim, self.context = model.frame_gap, model.action_dim, model.context
+        self.kind, self.camera, self.context = model.kind, model.camera, model.context
+        self.frame_gap, self.action_dim = model.frame_gap, model.action_dim
 
     def observe(self, rgb, depth, actions):
         return self.model.observe(rgb, depth, self.exchanged(actions))
