@@ -45,9 +45,9 @@ class ICEMConfig:
         for name, least in (("horizon", 1), ("population", 4), ("iterations", 1), ("elites", 2)):
             if getattr(self, name) < least:
                 raise UsageError(f"{name} is {getattr(self, name)}; give at least {least}")
-        if self.decay < 1:
+        if not self.decay >= 1:
             raise UsageError(f"decay is {self.decay}; give 1 (constant population) or more")
-        if not self.init_std > 0:
+        if not 0 < self.init_std < np.inf:
             raise UsageError(f"init_std is {self.init_std}; give a positive number of half action ranges")
         if not np.isfinite(self.noise_beta) or self.noise_beta < 0:
             raise UsageError(f"noise_beta is {self.noise_beta}; give 0 (white) or more")

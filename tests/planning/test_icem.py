@@ -193,7 +193,18 @@ def test_same_seed_same_plan():
 
 
 @pytest.mark.parametrize(
-    "options", [{"horizon": 0}, {"population": 1}, {"decay": 0.5}, {"momentum": 1.0}, {"noise_beta": np.nan}]
+    "options",
+    [
+        {"horizon": 0},
+        {"population": 1},
+        {"decay": 0.5},
+        {"momentum": 1.0},
+        {"init_std": np.inf},
+        *(
+            {name: np.nan}
+            for name in ("decay", "momentum", "init_std", "noise_beta", "keep_fraction", "shift_fraction")
+        ),
+    ],
 )
 def test_bad_settings_are_named(options):
     with pytest.raises(UsageError, match=next(iter(options))):
