@@ -193,6 +193,7 @@ def test_repeats_share_a_setup_but_not_their_randomness():
         (["--model", "t4vip"], "t3vip"),
         (["--model", "random", "random"], "once"),
         (["--episodes", 0], "episodes"),
+        (["--episodes", 2, "--setups", 1], "--episodes is 2 and --setups is 1"),
         (["--planner.horizon", 0], "horizon"),
         (["--model", "random", "--checkpoint", "/nowhere"], "checkpoint"),
         (["--checkpoint", "sv2p=/nowhere"], "sv2p"),
