@@ -198,6 +198,7 @@ def test_repeats_share_a_setup_but_not_their_randomness():
         (["--model", "random", "--checkpoint", "/nowhere"], "checkpoint"),
         (["--checkpoint", "sv2p=/nowhere"], "sv2p"),
         (["--deadline", "-1"], "deadline"),
+        (["--env", "planar-push", "--model", "sna"], "no sna ships for t3vip/PlanarPush-v0; train one and give it"),
     ],
 )
 def test_mistakes_are_one_line(tmp_path, run, options, word):
