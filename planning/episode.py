@@ -40,7 +40,7 @@ class Record:
     final_pixel_distance: float
     least_distance: float
     plan_seconds: float
-    """median wall time of a decision"""
+    """median wall time of a decision; 0 where none was taken down"""
     distances: list[float]
     """after every control step"""
     limits: list[float] = field(default_factory=lambda: list(THRESHOLDS))
@@ -65,6 +65,7 @@ class Record:
 def run_episode(
     env: gym.Env,
     setup: Setup,
+    name: str,
     controller: Controller,
     steps: int,
     repeat: int = 0,
@@ -78,6 +79,7 @@ def run_episode(
     Args:
         env: where; the simulator is the judge, not shown to the controller.
         setup: where it starts and what the goal is.
+        name: what the record calls the controller.
         controller: sees observations and the goal.
         steps: budget of control steps.
         repeat: number of this attempt at the setup.
@@ -106,7 +108,7 @@ def run_episode(
         if min(hits_3d.min(), hits_2d.min()) >= HITS:
             break
     return Record(
-        model=controller.name,
+        model=name,
         setup=setup.index,
         repeat=repeat,
         steps=len(distances),
@@ -118,7 +120,7 @@ def run_episode(
         final_distance=distances[-1],
         final_pixel_distance=pixel_distance,
         least_distance=min(distances),
-        plan_seconds=median(controller.plan_seconds),
+        plan_seconds=median(controller.plan_seconds or [0.0]),
         distances=[round(d, 5) for d in distances],
         limits=list(limits),
         part=setup.part if isinstance(setup, PointSetup) else "",

@@ -45,9 +45,9 @@ class ICEMConfig:
         for name, least in (("horizon", 1), ("population", 4), ("iterations", 1), ("elites", 2)):
             if getattr(self, name) < least:
                 raise UsageError(f"{name} is {getattr(self, name)}; give at least {least}")
-        if self.decay < 1:
+        if not self.decay >= 1:
             raise UsageError(f"decay is {self.decay}; give 1 (constant population) or more")
-        if not self.init_std > 0:
+        if not 0 < self.init_std < np.inf:
             raise UsageError(f"init_std is {self.init_std}; give a positive number of half action ranges")
         if not np.isfinite(self.noise_beta) or self.noise_beta < 0:
             raise UsageError(f"noise_beta is {self.noise_beta}; give 0 (white) or more")
@@ -92,10 +92,13 @@ class ICEM:
 
     Args:
         config: the search.
-        low, high: bounds of an action, (action_dim,).
+        low, high: bounds of an action, (action_dim,), each low below its high.
         rng: where the samples come from.
         deadline: seconds after which `plan` returns the best so far; checked before each iteration but the first,
             against the time that the iteration is likely to take. None: no deadline.
+
+    Raises:
+        UsageError: the bounds leave nothing to search.
     """
 
     def __init__(
@@ -111,6 +114,7 @@ class ICEM:
         self.high = np.asarray(high, np.float64)
         self.rng = rng
         self.deadline = deadline
+        self._check_bounds()
         self.reset()
 
     def reset(self) -> None:
@@ -164,6 +168,14 @@ class ICEM:
         self.mean = np.concatenate([self.mean[1:], self.mean[-1:]])
         self._reset_std()
         return Plan(best.copy(), best_cost, rollouts, complete)
+
+    def _check_bounds(self) -> None:
+        same = self.low.ndim == 1 and self.low.shape == self.high.shape
+        if not (same and np.all((self.low < self.high) & np.isfinite(self.high - self.low))):
+            raise UsageError(
+                f"low is {self.low.tolist()}, high is {self.high.tolist()}; give two lists of as many finite numbers,"
+                " each low below its high"
+            )
 
     def _reset_std(self) -> None:
         self.std = np.tile(self.config.init_std * (self.high - self.low) / 2, (self.config.horizon, 1))

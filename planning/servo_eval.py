@@ -28,6 +28,7 @@ from planning.setups import Setup
 from planning.tasks import TASKS, Task
 from worldmodel.memory import keep_freed_memory
 
+EPISODES = 50  # per model, unless the command says otherwise
 EPISODE_ENTROPY = 0xE9150DE  # sets the planners' randomness apart from the setups'
 
 
@@ -51,8 +52,8 @@ class ServoConfig:
     the simulator; linear, proportional and random have no world model"""
     checkpoint: tuple[str, ...] = ()
     """weights to use instead of the shipped ones: a checkpoint folder, or MODEL=FOLDER for each of several models"""
-    episodes: int = 50
-    """episodes per model, each in a setup of its own"""
+    episodes: int | None = None
+    """episodes per model, each in a setup of its own; 50 unless --setups says otherwise"""
     setups: int | None = None
     """distinct setups; with --repeats in place of --episodes"""
     repeats: int = 1
@@ -87,11 +88,14 @@ class ServoConfig:
                 raise UsageError(f"unknown model '{name}'; known are {', '.join(CONTROLLERS)}")
         if not self.model or len(set(self.model)) < len(self.model):
             raise UsageError(f"--model is {' '.join(self.model) or 'empty'}; name each model once")
-        for option in ("episodes", "repeats", "steps", "image_size", "hold"):
-            if getattr(self, option) < 1:
-                raise UsageError(f"--{option.replace('_', '-')} is {getattr(self, option)}; give at least 1")
-        if self.setups is not None and self.setups < 1:
-            raise UsageError(f"--setups is {self.setups}; give at least 1")
+        for option in ("episodes", "setups", "repeats", "steps", "image_size", "hold"):
+            value = getattr(self, option)
+            if value is not None and value < 1:
+                raise UsageError(f"--{option.replace('_', '-')} is {value}; give at least 1")
+        if self.episodes is not None and self.setups is not None:
+            raise UsageError(
+                f"--episodes is {self.episodes} and --setups is {self.setups}; give one of them, --repeats with either"
+            )
         if self.seed < 0 or self.video < 0:
             raise UsageError(f"--seed is {self.seed}, --video is {self.video}; give 0 or more")
         if self.deadline is not None and not self.deadline > 0:
@@ -123,9 +127,8 @@ class ServoConfig:
 
     def attempts(self) -> list[tuple[int, int]]:
         """(setup, repeat) of every episode of a model."""
-        setups = self.setups if self.setups is not None else -(-self.episodes // self.repeats)
-        pairs = [(setup, repeat) for setup in range(setups) for repeat in range(self.repeats)]
-        return pairs if self.setups is not None else pairs[: self.episodes]
+        episodes = self.setups * self.repeats if self.setups is not None else self.episodes or EPISODES
+        return [divmod(episode, self.repeats) for episode in range(episodes)]
 
 
 def main(config: ServoConfig) -> None:
@@ -208,7 +211,7 @@ def run_missing(config: ServoConfig, env: gym.Env, studio: Studio, kit: Kit, log
             kit.rng = np.random.default_rng(np.random.SeedSequence(entropy))
             film = Film(studio, setup, name) if wants_film(config, index, repeat) else None
             record = run_episode(
-                env, setup, CONTROLLERS[name](kit), config.steps, repeat, film.watch if film is not None else None
+                env, setup, name, CONTROLLERS[name](kit), config.steps, repeat, film.watch if film is not None else None
             )
             if film is not None:
                 film.save(film_path(config.out / "videos", record))

@@ -37,6 +37,8 @@ class Config:
         for name in ("episodes", "steps"):
             if getattr(self, name) < 1:
                 raise UsageError(f"--{name} is {getattr(self, name)}; give at least 1")
+        if self.seed < 0:
+            raise UsageError(f"--seed is {self.seed}; give 0 or more")
 
 
 def main(config: Config) -> None:

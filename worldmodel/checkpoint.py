@@ -125,7 +125,7 @@ def load_model(name: str | Path, device: str | torch.device = "cpu", precision: 
         The model in evaluation mode.
 
     Raises:
-        UsageError: it is not there or damaged, or there is no such device.
+        UsageError: it is not there or damaged, or there is no such device or precision.
     """
     folder, device = find_model(name), find_device(device)
     try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 
@@ -46,7 +46,13 @@ def prepare_devices(deterministic: bool) -> None:
 
 
 def find_precision(name: Precision, device: torch.device) -> Literal["float32", "bfloat16"]:
-    """The name of a precision; of `auto`, that of the best there is."""
+    """The name of a precision; of `auto`, that of the best there is.
+
+    Raises:
+        UsageError: there is no such precision.
+    """
+    if name not in get_args(Precision):
+        raise UsageError(f"precision is '{name}'; give one of {', '.join(get_args(Precision))}")
     if name != "auto":
         return name
     return "bfloat16" if best_precision(device) == torch.bfloat16 else "float32"

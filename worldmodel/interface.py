@@ -6,7 +6,9 @@ are others it still predicts, and what it predicts means nothing.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +20,9 @@ from worldmodel.world_model import WorldModel
 
 TOLERANCE = 1e-3
 """Relative, of what is measured rather than counted."""
+
+Pair = tuple[str, Any, Any]
+"""What is compared: its name, the given one and the wanted one."""
 
 
 @dataclass(frozen=True)
@@ -57,23 +62,28 @@ def mismatch(given: Interface, wanted: Interface) -> str | None:
         As in "depth range (1.0, 4.0), not (1.0, 3.0)"; None if they agree. The camera's pose, the scene and the control
         rate may differ.
     """
-    exact = (
-        ("image size", _size(given.camera), _size(wanted.camera)),
-        ("action size", len(given.action_scale), len(wanted.action_scale)),
-        ("action aggregation", given.action_aggregation, wanted.action_aggregation),
+    return camera_mismatch(given.camera, wanted.camera) or _difference(
+        exact=(
+            ("action size", len(given.action_scale), len(wanted.action_scale)),
+            ("action aggregation", given.action_aggregation, wanted.action_aggregation),
+        ),
+        measured=(("action scale", given.action_scale, wanted.action_scale),),
     )
-    for what, theirs, ours in exact:
-        if theirs != ours:
-            return f"{what} {theirs}, not {ours}"
-    measured = (
-        ("action scale", given.action_scale, wanted.action_scale),
-        ("depth range", (given.camera.near, given.camera.far), (wanted.camera.near, wanted.camera.far)),
-        ("intrinsics fx, fy, cx, cy", _intrinsics(given.camera), _intrinsics(wanted.camera)),
+
+
+def camera_mismatch(given: CameraModel, wanted: CameraModel) -> str | None:
+    """The first thing that keeps a model made for the camera `wanted` from being shown what `given` takes.
+
+    Returns:
+        As `mismatch` does.
+    """
+    return _difference(
+        exact=(("image size", _size(given), _size(wanted)),),
+        measured=(
+            ("depth range", (given.near, given.far), (wanted.near, wanted.far)),
+            ("intrinsics fx, fy, cx, cy", _intrinsics(given), _intrinsics(wanted)),
+        ),
     )
-    for what, these, those in measured:
-        if not np.allclose(these, those, TOLERANCE, 0):
-            return f"{what} {these}, not {those}"
-    return None
 
 
 def check_fits(name: str, model: WorldModel, dataset: RGBDDataset) -> list[str]:
@@ -103,6 +113,17 @@ def check_fits(name: str, model: WorldModel, dataset: RGBDDataset) -> list[str]:
     if _family(given.env_id) != _family(wanted.env_id):
         notes.append(f"{dataset.path} comes from {given.env_id}, {name} was trained on {wanted.env_id}")
     return notes
+
+
+def _difference(exact: Iterable[Pair], measured: Iterable[Pair]) -> str | None:
+    """The first pair that differs of what is counted, then of what is measured."""
+    for what, given, wanted in exact:
+        if given != wanted:
+            return f"{what} {given}, not {wanted}"
+    for what, given, wanted in measured:
+        if not np.allclose(given, wanted, TOLERANCE, 0):
+            return f"{what} {given}, not {wanted}"
+    return None
 
 
 def _size(camera: CameraModel) -> tuple[int, int]:

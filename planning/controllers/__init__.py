@@ -7,14 +7,12 @@ from collections.abc import Callable
 from planning.controllers.base import Controller, Goal
 from planning.controllers.baselines import LinearController, ProportionalController, RandomController
 from planning.controllers.kit import Kit
+from planning.controllers.learned import PIXEL_MODELS
 from planning.controllers.oracle import OracleController
 from planning.controllers.pixel import PixelController
 from planning.controllers.t3vip import T3VIPController
 
 __all__ = ["CONTROLLERS", "LEARNED", "PIXEL_MODELS", "Controller", "Goal", "Kit"]
-
-PIXEL_MODELS = ("sv2p", "sna", "cdna")
-"""The controllers that know their goal as a pixel."""
 
 LEARNED = ("t3vip", *PIXEL_MODELS)
 """The controllers that need a world model's weights."""
@@ -24,7 +22,7 @@ def _pixel(name: str) -> Callable[[Kit], Controller]:
     return lambda kit: PixelController(name, kit.model(name), kit.camera, **kit.planning_parts())
 
 
-# A new controller is one line.
+# A new controller is one line; its results and films go by its name here.
 CONTROLLERS: dict[str, Callable[[Kit], Controller]] = {
     "t3vip": lambda kit: T3VIPController(kit.model("t3vip"), kit.camera, **kit.planning_parts()),
     **{name: _pixel(name) for name in PIXEL_MODELS},

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.errors import UsageError
 from planning.costs import Reach
 from planning.effectors import Arm, Effector, Observation, held_gripper
 from planning.followers import EffectorFollower, Follower
@@ -18,9 +19,12 @@ __all__ = ["Controller", "Goal", "HoldingController", "Observation", "PlanningCo
 
 
 class Controller(Protocol):
-    """Brings the designated point to a goal, one action per control step."""
+    """Brings the designated point to a goal, one action per control step.
 
-    name: str
+    Attributes:
+        plan_seconds: wall time of each decision of the current episode; empty if it takes none down.
+    """
+
     plan_seconds: list[float]
 
     def reset(self, observation: Observation, goal: Goal) -> None:
@@ -43,8 +47,6 @@ class HoldingController:
     Attributes:
         plan_seconds: wall time of each decision of the current episode.
     """
-
-    name = "holding"
 
     def __init__(self, hold: int, effector: Effector | None = None, follower: Follower | None = None) -> None:
         self.hold = hold
@@ -84,9 +86,12 @@ class PlanningController(HoldingController):
     A subclass says in `imagine` what a sequence of moves costs.
 
     Args:
-        planner: searches sequences of moves.
+        planner: searches sequences of moves, within the effector's limit.
         hold, effector, follower: see `HoldingController`.
         reach: draws the end-effector to the thing that the point is on, if given.
+
+    Raises:
+        UsageError: the planner's bounds are no moves of the effector.
     """
 
     def __init__(
@@ -98,6 +103,12 @@ class PlanningController(HoldingController):
         reach: Reach | None = None,
     ) -> None:
         super().__init__(hold, effector, follower)
+        axes, limit = self.effector.axes, self.effector.limit
+        if planner.low.shape != (axes,) or max(-planner.low.min(), planner.high.max()) > limit:
+            raise UsageError(
+                f"the planner searches from {planner.low.tolist()} to {planner.high.tolist()}, but a move of the"
+                f" {type(self.effector).__name__} is {axes} numbers from {-limit} to {limit}; give such low and high"
+            )
         self.planner, self.reach = planner, reach
 
     def reset(self, observation: Observation, goal: Goal) -> None:

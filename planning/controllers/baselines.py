@@ -20,8 +20,6 @@ METRES_PER_ACTION = ACTION_SCALE[0]  # of a full translation of the arm over one
 class RandomController(HoldingController):
     """Uniform moves, held as long as a planned one: the lower bound."""
 
-    name = "random"
-
     def __init__(self, hold: int, rng: np.random.Generator, effector: Effector | None = None) -> None:
         super().__init__(hold, effector)
         self.rng = rng
@@ -44,8 +42,6 @@ class ProportionalController(HoldingController):
         gain: share of the remaining way that is commanded per step.
     """
 
-    name = "proportional"
-
     def __init__(self, effector: Effector | None = None, follower: Follower | None = None, gain: float = 0.5) -> None:
         super().__init__(1, effector, follower)
         self.gain = gain
@@ -63,7 +59,6 @@ class LinearController(PlanningController):
     refits B to the whole episode. What it costs to learn the arm anew is thus inside the budget of steps.
     """
 
-    name = "linear"
     ridge = 1e-6  # keeps the fit defined; in squared action units, against probes of size 1
 
     def reset(self, observation: Observation, goal: Goal) -> None:

@@ -87,11 +87,15 @@ class Kit:
         """The world model of that name, in evaluation mode.
 
         Raises:
-            UsageError: there is no such checkpoint, or it was trained for another environment.
+            UsageError: there is no such checkpoint, none was given and none ships for the environment, or it was
+                trained for another one.
         """
         if name not in self._models:
-            shipped = checkpoint.PRETRAINED / (FAMILIES[_family(_env_id(self.env))] + name)
-            model = checkpoint.load_model(self.checkpoints.get(name, shipped), self.device)
+            env_id = _env_id(self.env)
+            shipped = FAMILIES[_family(env_id)] + name
+            if name not in self.checkpoints and shipped not in checkpoint.shipped_models():
+                raise UsageError(f"no {name} ships for {env_id}; train one and give it: --checkpoint {name}=FOLDER")
+            model = checkpoint.load_model(self.checkpoints.get(name, checkpoint.PRETRAINED / shipped), self.device)
             _check_fits(name, model, self.env)
             self._models[name] = model
         return self._models[name]

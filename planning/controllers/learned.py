@@ -11,8 +11,13 @@ from numpy.typing import NDArray
 
 from data_collection.actions import aggregate_actions
 from envs.camera import CameraModel
+from envs.errors import UsageError
 from planning.controllers.base import Goal, Observation, PlanningController
 from planning.icem import ICEM
+from worldmodel.interface import camera_mismatch
+
+PIXEL_MODELS = ("sv2p", "sna", "cdna")
+"""The world models that predict pictures only. A controller that plans with one knows its goal as a pixel."""
 
 
 class LearnedController(PlanningController):
@@ -24,15 +29,21 @@ class LearnedController(PlanningController):
 
     Args:
         model: a world model (`worldmodel.load_model`) with `observe`, `step` and `frame_gap`.
-        camera: geometry of the camera that takes the frames.
+        camera: geometry of the camera that takes the frames; but for its pose, the one that the model was trained with.
         planner: searches sequences of moves, each held for `frame_gap` control steps.
         context_frames: frames that the model is shown before every plan.
         options: effector, follower, reach; see `PlanningController`.
 
+    Raises:
+        UsageError: the model is of another kind, or was trained with another camera.
+
     Attributes:
+        kinds: of models that it can plan with; those of pictures unless a subclass says otherwise.
         frames: the last frames that the model is shown, the newest last.
         designated: for each of them the pixels (M,) that show the body of the designated point, counted row by row.
     """
+
+    kinds: tuple[str, ...] = PIXEL_MODELS
 
     def __init__(
         self,
@@ -42,6 +53,17 @@ class LearnedController(PlanningController):
         context_frames: int = 2,
         **options: Any,
     ) -> None:
+        if model.kind not in self.kinds:
+            raise UsageError(
+                f"the model is a {model.kind}, but {type(self).__name__} plans with {' or '.join(self.kinds)};"
+                " give a model of that kind"
+            )
+        difference = camera_mismatch(camera, model.camera)
+        if difference is not None:
+            raise UsageError(
+                f"the camera has {difference}, which the {model.kind} was trained on; give a model of this camera, or"
+                " an environment with the model's"
+            )
         super().__init__(planner, model.frame_gap, **options)
         self.model, self.camera = model, camera
         self.context_frames = context_frames

@@ -23,8 +23,6 @@ class OracleController(PlanningController):
         planner, hold, options: see `PlanningController`.
     """
 
-    name = "oracle"
-
     def __init__(self, what_if: WhatIf, mark: Mark | None, planner: ICEM, hold: int, **options: Any) -> None:
         super().__init__(planner, hold, **options)
         self.what_if, self.mark = what_if, mark

@@ -17,7 +17,7 @@ from worldmodel.tracking import Track
 class T3VIPController(LearnedController):
     """Brings the point to its goal by the predicted motion, in space, of the pixels around it."""
 
-    name = "t3vip"
+    kinds = ("t3vip",)
 
     def imagine(self, observation: Observation) -> CostFunction:
         foresee = self.foresight(observation)

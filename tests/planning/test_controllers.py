@@ -1,10 +1,14 @@
 """Controllers in a world of arrays: they get observations, the camera's geometry and the goal, nothing else."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from envs.errors import UsageError
 from planning.controllers.base import HoldingController
 from planning.controllers.baselines import LinearController, ProportionalController, RandomController
+from planning.controllers.pixel import PixelController
 from planning.controllers.t3vip import T3VIPController
 from planning.icem import ICEM, ICEMConfig
 
@@ -101,6 +105,37 @@ def test_random_is_uniform_and_held(world, goal):
     actions = np.array([controller.act(observation) for _ in range(900)])
     np.testing.assert_array_equal(actions[0::3], actions[2::3])
     assert np.abs(actions[:, :3].mean()) < 0.05 and actions[:, :3].std() == pytest.approx(1 / np.sqrt(3), abs=0.03)
+
+
+@pytest.mark.parametrize("bounds", [np.ones(7), np.ones(2), np.full(3, 1.5)])
+def test_a_planner_searches_moves_of_the_effector(bounds):
+    search = ICEM(ICEMConfig(), -bounds, bounds, np.random.default_rng(0))
+    with pytest.raises(UsageError, match=r"a move of the Arm is 3 numbers from -1.0 to 1.0; give such"):
+        LinearController(search, hold=3)
+
+
+def test_a_model_of_another_kind_is_refused(exact_model, pixel_model, camera):
+    with pytest.raises(UsageError, match="the model is a sv2p, but T3VIPController plans with t3vip;"):
+        T3VIPController(pixel_model, camera, planner())
+    with pytest.raises(UsageError, match="the model is a t3vip, but PixelController plans with sv2p or"):
+        PixelController("t3vip", exact_model, camera, planner())
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda camera: {"K": camera.K * [[1.5], [1.5], [1]]}, "intrinsics"),
+        (lambda camera: {"far": 2 * camera.far}, r"depth range \(3.5, 11.0\), not \(3.5, 5.5\)"),
+        (lambda camera: {"width": 128, "height": 128}, r"image size \(128, 128\), not \(64, 64\)"),
+    ],
+)
+def test_a_camera_that_the_model_does_not_know_is_refused(exact_model, camera, change, words):
+    with pytest.raises(UsageError, match=f"the camera has {words}.*; give"):
+        T3VIPController(exact_model, replace(camera, **change(camera)), planner())
+
+
+def test_a_camera_may_stand_elsewhere(exact_model, camera):
+    T3VIPController(exact_model, replace(camera, world_T_camera=np.eye(4)), planner())
 
 
 def test_holding_is_an_interface():

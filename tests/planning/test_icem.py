@@ -193,11 +193,38 @@ def test_same_seed_same_plan():
 
 
 @pytest.mark.parametrize(
-    "options", [{"horizon": 0}, {"population": 1}, {"decay": 0.5}, {"momentum": 1.0}, {"noise_beta": np.nan}]
+    "options",
+    [
+        {"horizon": 0},
+        {"population": 1},
+        {"decay": 0.5},
+        {"momentum": 1.0},
+        {"init_std": np.inf},
+        *(
+            {name: np.nan}
+            for name in ("decay", "momentum", "init_std", "noise_beta", "keep_fraction", "shift_fraction")
+        ),
+    ],
 )
 def test_bad_settings_are_named(options):
     with pytest.raises(UsageError, match=next(iter(options))):
         ICEMConfig(**options)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        (-1, 1),
+        (-np.ones((1, 3)), np.ones((1, 3))),
+        (-np.ones(2), HIGH),
+        (HIGH, LOW),
+        (LOW, [1, 1, -1]),
+        (LOW, HIGH * np.inf),
+    ],
+)
+def test_bounds_that_leave_nothing_to_search_are_refused(low, high):
+    with pytest.raises(UsageError, match=r"low is .*, high is .*; give"):
+        ICEM(ICEMConfig(), low, high, np.random.default_rng(0))
 
 
 def test_a_cost_of_the_wrong_shape_is_a_bug():

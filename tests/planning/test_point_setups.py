@@ -85,7 +85,7 @@ def test_the_oracle_pushes_a_point_to_its_goal_as_its_simulator_says(push):
     task = TASKS["planar-push", "object"]
     kit.body, kit.reach, kit.surface, kit.mark = task.body, task.reach, task.surface, setup.mark
     try:
-        record = run_episode(push, setup, CONTROLLERS["oracle"](kit), 60)
+        record = run_episode(push, setup, "oracle", CONTROLLERS["oracle"](kit), 60)
         assert record.reached("3d") and record.reached("2d") and record.limits[0] == 0.02 and record.part == "behind"
         state, actions = kit.simulator.state(), np.random.default_rng(1).uniform(-1, 1, (1, 6, 3))
         paths = kit.simulator.paths(state, actions, setup.mark)
@@ -95,7 +95,7 @@ def test_the_oracle_pushes_a_point_to_its_goal_as_its_simulator_says(push):
         push.step(action)
     np.testing.assert_allclose(paths.point[0, -1], setup.mark.position(push), atol=5e-4)  # it may tilt
     np.testing.assert_allclose(paths.effector[0, -1], push.unwrapped.tcp_position, atol=1e-6)
-    assert not run_episode(push, setup, CONTROLLERS["random"](kit), 20).reached("3d")
+    assert not run_episode(push, setup, "random", CONTROLLERS["random"](kit), 20).reached("3d")
 
 
 def test_shipped_models_are_those_of_the_environment(push, table, monkeypatch):

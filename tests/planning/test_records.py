@@ -57,9 +57,9 @@ def test_finished_episodes_are_filmed_when_a_film_is_asked_for(tmp_path, monkeyp
     """Without a simulator: an episode is a number that is drawn."""
     ran = []
 
-    def run_episode(env, setup, drawn, steps, repeat, watch):
+    def run_episode(env, setup, name, drawn, steps, repeat, watch):
         ran.append(drawn)
-        return record("random", setup.index, repeat=repeat)
+        return record(name, setup.index, repeat=repeat)
 
     monkeypatch.setattr(servo_eval, "run_episode", run_episode)
     monkeypatch.setattr(servo_eval, "Film", Reel)

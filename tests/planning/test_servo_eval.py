@@ -13,6 +13,9 @@ import pytest
 from envs.errors import UsageError
 from planning import servo_eval
 from planning.controllers import CONTROLLERS, Goal, Kit
+from planning.controllers.base import held_gripper
+from planning.controllers.baselines import ProportionalController
+from planning.costs import env_action
 from planning.episode import THRESHOLDS, run_episode
 from planning.film import Film, Studio
 from planning.servo_eval import ServoConfig, command, main
@@ -52,7 +55,7 @@ def setup_of(env, index):
 def episode(env, name, index, steps):
     kit = Kit(env, rng=np.random.default_rng(index))
     try:
-        return run_episode(env, setup_of(env, index), CONTROLLERS[name](kit), steps)
+        return run_episode(env, setup_of(env, index), name, CONTROLLERS[name](kit), steps)
     finally:
         kit.close()
 
@@ -95,8 +98,8 @@ def test_pictures_do_not_know_the_goal(env):
             observations.append({key: np.array(value) for key, value in observation.items()})
             return inner.act(observation)
 
-        spy = SimpleNamespace(name="spy", plan_seconds=[0.0], reset=inner.reset, act=act)
-        run_episode(env, variant, spy, 6, watch=film.watch if film else None)
+        spy = SimpleNamespace(plan_seconds=[0.0], reset=inner.reset, act=act)
+        run_episode(env, variant, "spy", spy, 6, watch=film.watch if film else None)
         seen.append(observations)
     studio.close()
     for others in seen[1:]:
@@ -140,6 +143,43 @@ def test_command_writes_everything_and_resumes_episode_by_episode(tmp_path, run,
     assert code == 2 and "seed" in err and err.count("\n") == 1
 
 
+class Lazy(ProportionalController):
+    """One of the controllers there are, with a change."""
+
+    def decide(self, observation):
+        return 0 * super().decide(observation)
+
+
+def test_results_go_by_the_name_that_a_controller_is_asked_for_by(tmp_path, monkeypatch):
+    monkeypatch.setitem(CONTROLLERS, "lazy", lambda kit: Lazy(**kit.parts()))
+    for models in (("proportional",), ("proportional", "lazy"), ("proportional",)):
+        main(ServoConfig(out=tmp_path, model=models, episodes=1, steps=4, video=1))
+    lines = [json.loads(line) for line in (tmp_path / "episodes.jsonl").read_text().splitlines()]
+    assert [line["model"] for line in lines] == ["proportional", "lazy"]
+    assert lines[0]["final_distance"] < 0.9 * lines[1]["final_distance"]
+    assert {path.stem for path in (tmp_path / "videos").iterdir()} == {"proportional-setup00-0", "lazy-setup00-0"}
+
+
+class Still:
+    """All that a controller needs."""
+
+    def __init__(self):
+        self.plan_seconds = []
+
+    def reset(self, observation, goal):
+        self.gripper = held_gripper(observation)
+
+    def act(self, observation):
+        return env_action(np.zeros(3), self.gripper)
+
+
+def test_a_controller_need_not_take_down_how_long_it_decides(tmp_path, monkeypatch):
+    monkeypatch.setitem(CONTROLLERS, "still", lambda kit: Still())
+    main(ServoConfig(out=tmp_path, model=("still",), episodes=1, steps=2))
+    entry = json.loads((tmp_path / "servo.json").read_text())["models"]["still"]
+    assert entry["plan_seconds_median"] == 0 and entry["episodes"] == 1
+
+
 def test_repeats_share_a_setup_but_not_their_randomness():
     config = ServoConfig(out="x", model=("random",), setups=2, repeats=3)
     assert config.attempts() == [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)]
@@ -153,10 +193,12 @@ def test_repeats_share_a_setup_but_not_their_randomness():
         (["--model", "t4vip"], "t3vip"),
         (["--model", "random", "random"], "once"),
         (["--episodes", 0], "episodes"),
+        (["--episodes", 2, "--setups", 1], "--episodes is 2 and --setups is 1"),
         (["--planner.horizon", 0], "horizon"),
         (["--model", "random", "--checkpoint", "/nowhere"], "checkpoint"),
         (["--checkpoint", "sv2p=/nowhere"], "sv2p"),
         (["--deadline", "-1"], "deadline"),
+        (["--env", "planar-push", "--model", "sna"], "no sna ships for t3vip/PlanarPush-v0; train one and give it"),
     ],
 )
 def test_mistakes_are_one_line(tmp_path, run, options, word):

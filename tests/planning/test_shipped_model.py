@@ -27,7 +27,8 @@ class Shuffled(torch.nn.Module):
     def __init__(self, model) -> None:
         super().__init__()
         self.model = model
-        self.frame_gap, self.action_dim, self.context = model.frame_gap, model.action_dim, model.context
+        self.kind, self.camera, self.context = model.kind, model.camera, model.context
+        self.frame_gap, self.action_dim = model.frame_gap, model.action_dim
 
     def observe(self, rgb, depth, actions):
         return self.model.observe(rgb, depth, self.exchanged(actions))
@@ -69,7 +70,7 @@ def planner() -> ICEM:
 
 def left(env, controller, index: int) -> float:
     """Least share of the way that was left at any time of a servo episode."""
-    record = run_episode(env, make_setup(env, index, seed=99), controller, steps=60)
+    record = run_episode(env, make_setup(env, index, seed=99), "any", controller, steps=60)
     return record.least_distance / record.initial_distance
 
 
@@ -95,8 +96,6 @@ def test_fails_when_action_channels_are_shuffled_before_the_model(env, model):
 class Witness:
     """Keeps what it is shown, and stands still."""
 
-    name = "witness"
-
     def __init__(self) -> None:
         self.plan_seconds = [0.0]
         self.shown: list[dict] = []
@@ -116,7 +115,7 @@ def test_neither_pictures_nor_scene_show_the_goal(env):
         point = setup.goal.point_world + shift
         goal = Goal(point, camera.project(camera.to_camera(point)))
         witnesses.append(Witness())
-        run_episode(env, replace(setup, goal=goal), witnesses[-1], steps=3)
+        run_episode(env, replace(setup, goal=goal), "witness", witnesses[-1], steps=3)
         things = np.concatenate([data.xpos, data.geom_xpos, data.site_xpos, data.light_xpos])
         assert np.linalg.norm(things - point, axis=1).min() > CLEARANCE
     for one, other in zip(*(witness.shown for witness in witnesses), strict=True):

@@ -50,6 +50,11 @@ def test_a_model_comes_back_from_its_folder_and_from_its_run(saved):
     torch.testing.assert_close(ours.rgb, theirs.rgb)
 
 
+def test_a_precision_that_there_is_not_is_named(saved):
+    with pytest.raises(UsageError, match="precision is 'fp16'; give one of auto, float32, bfloat16"):
+        load_model(saved[1], precision="fp16")
+
+
 def test_a_newer_model_replaces_the_older_one(saved, make_model):
     _, folder = saved
     newer = make_model(seed=1)
