@@ -7,9 +7,8 @@ from collections.abc import Callable
 from planning.controllers.base import Controller, Goal
 from planning.controllers.baselines import LinearController, ProportionalController, RandomController
 from planning.controllers.kit import Kit
-from planning.controllers.learned import PIXEL_MODELS
 from planning.controllers.oracle import OracleController
-from planning.controllers.pixel import PixelController
+from planning.controllers.pixel import PIXEL_MODELS, PixelController
 from planning.controllers.t3vip import T3VIPController
 
 __all__ = ["CONTROLLERS", "LEARNED", "PIXEL_MODELS", "Controller", "Goal", "Kit"]
@@ -19,7 +18,7 @@ LEARNED = ("t3vip", *PIXEL_MODELS)
 
 
 def _pixel(name: str) -> Callable[[Kit], Controller]:
-    return lambda kit: PixelController(name, kit.model(name), kit.camera, **kit.planning_parts())
+    return lambda kit: PixelController(kit.model(name), kit.camera, **kit.planning_parts())
 
 
 # A new controller is one line; its results and films go by its name here.

@@ -15,9 +15,7 @@ from envs.errors import UsageError
 from planning.controllers.base import Goal, Observation, PlanningController
 from planning.icem import ICEM
 from worldmodel.interface import camera_mismatch
-
-PIXEL_MODELS = ("sv2p", "sna", "cdna")
-"""The world models that predict pictures only. A controller that plans with one knows its goal as a pixel."""
+from worldmodel.models import KINDS
 
 
 class LearnedController(PlanningController):
@@ -38,12 +36,12 @@ class LearnedController(PlanningController):
         UsageError: the model is of another kind, or was trained with another camera.
 
     Attributes:
-        kinds: of models that it can plan with; those of pictures unless a subclass says otherwise.
+        kinds: of models that it can plan with; all, unless a subclass says otherwise.
         frames: the last frames that the model is shown, the newest last.
         designated: for each of them the pixels (M,) that show the body of the designated point, counted row by row.
     """
 
-    kinds: tuple[str, ...] = PIXEL_MODELS
+    kinds: tuple[str, ...] = tuple(KINDS)
 
     def __init__(
         self,

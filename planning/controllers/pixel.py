@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from envs.camera import CameraModel
 from planning.controllers.base import Goal, Observation
 from planning.controllers.learned import LearnedController
 from planning.costs import discounted_distance
-from planning.icem import ICEM, CostFunction
+from planning.icem import CostFunction
 from worldmodel.pixel_tracking import PixelTrack, uniform_pixels
+
+PIXEL_MODELS = ("sv2p", "sna", "cdna")
+"""The world models that predict pictures only. A controller that plans with one knows its goal as a pixel."""
 
 
 class PixelController(LearnedController):
@@ -24,13 +25,10 @@ class PixelController(LearnedController):
     the point. The goal is a pixel; the point in space behind it is withheld.
 
     Args:
-        name: of the model.
         model, camera, planner, options: see `LearnedController`.
     """
 
-    def __init__(self, name: str, model: Any, camera: CameraModel, planner: ICEM, **options: Any) -> None:
-        super().__init__(model, camera, planner, **options)
-        self.name = name
+    kinds = PIXEL_MODELS
 
     def reset(self, observation: Observation, goal: Goal) -> None:
         super().reset(observation, replace(goal, point_world=np.full(3, np.nan)))

@@ -118,7 +118,7 @@ def test_a_model_of_another_kind_is_refused(exact_model, pixel_model, camera):
     with pytest.raises(UsageError, match="the model is a sv2p, but T3VIPController plans with t3vip;"):
         T3VIPController(pixel_model, camera, planner())
     with pytest.raises(UsageError, match="the model is a t3vip, but PixelController plans with sv2p or"):
-        PixelController("t3vip", exact_model, camera, planner())
+        PixelController(exact_model, camera, planner())
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ def servo(controller, world, goal, steps=30):
 
 def test_reaches_the_pixel_with_an_exact_model(pixel_model, camera, world, goal):
     way = np.linalg.norm(pixel_of(world) - goal.pixel)
-    _, distances = servo(PixelController("sv2p", pixel_model, camera, planner()), world, goal)
+    _, distances = servo(PixelController(pixel_model, camera, planner()), world, goal)
     assert way > 15 and (distances <= 0.1 * way).sum() >= 5 and distances[-8:].max() < 0.15 * way
 
 
@@ -42,7 +42,7 @@ def test_needs_its_model(make_pixel_model, camera, world, goal):
     """With the action's numbers mixed up before the model, the TCP misses the pixel."""
     model = make_pixel_model(camera, channels=(1, 2, 0, 3, 4, 5, 6))
     way = np.linalg.norm(pixel_of(world) - goal.pixel)
-    _, distances = servo(PixelController("sv2p", model, camera, planner()), world, goal)
+    _, distances = servo(PixelController(model, camera, planner()), world, goal)
     assert (distances <= 0.1 * way).sum() < 5
 
 
@@ -54,7 +54,7 @@ def test_does_not_know_how_far_away_the_goal_is(pixel_model, camera, world, goal
         world.tcp, world.steps = start.copy(), 0
         point = goal.point_world + along * (goal.point_world - camera.world_T_camera[:3, 3])
         moved = dataclasses.replace(goal, point_world=point)
-        runs.append(servo(PixelController("sv2p", pixel_model, camera, planner()), world, moved, steps=12)[0])
+        runs.append(servo(PixelController(pixel_model, camera, planner()), world, moved, steps=12)[0])
     for other in runs[1:]:
         np.testing.assert_array_equal(runs[0], other)
 
@@ -78,13 +78,13 @@ def hand_of(world, *boxes):
 
 def test_it_is_the_tcp_that_goes_to_the_pixel_not_the_hand(pixel_model, camera, world, goal):
     world.observation = hand_of(world, (-2, 2, -5, 0))
-    _, distances = servo(PixelController("sv2p", pixel_model, camera, planner()), world, goal)
+    _, distances = servo(PixelController(pixel_model, camera, planner()), world, goal)
     assert np.median(distances[-8:]) < 1.0  # the hand's mean is 2.5 pixels beside
 
 
 def test_at_the_goal_nothing_is_better_than_to_stay_however_the_hand_is_shaped(pixel_model, camera, world, goal):
     world.observation = hand_of(world, (-2, 2, -2, -1), (0, 0, 0, 5))  # most of its pixels on one side, a thumb
-    controller = PixelController("sv2p", pixel_model, camera, planner())
+    controller = PixelController(pixel_model, camera, planner())
     observation = world.observation()
     controller.reset(observation, dataclasses.replace(goal, pixel=pixel_of(world)))
     controller.act(observation)
@@ -96,7 +96,7 @@ def test_at_the_goal_nothing_is_better_than_to_stay_however_the_hand_is_shaped(p
 
 def test_designated_are_the_pixels_of_the_hand_in_both_frames(pixel_model, camera, world, goal):
     world.observation = hand_of(world, (-2, 2, 0, 5))
-    controller = PixelController("sv2p", pixel_model, camera, planner())
+    controller = PixelController(pixel_model, camera, planner())
     observation = world.observation()
     controller.reset(observation, goal)
     for _ in range(4):
@@ -125,7 +125,7 @@ def test_designated_are_the_pixels_of_the_hand_in_both_frames(pixel_model, camer
 
 def test_a_hand_lost_from_the_picture_costs_infinitely(pixel_model, camera, world, goal):
     """A future without a place must not look like a good one."""
-    controller = PixelController("sv2p", pixel_model, camera, planner())
+    controller = PixelController(pixel_model, camera, planner())
     observation = world.observation()
     controller.reset(observation, goal)
     controller.act(observation)

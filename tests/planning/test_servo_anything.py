@@ -144,7 +144,7 @@ def test_a_model_of_pictures_brings_it_to_the_pixel(block, far, make_pixel_model
     shift = model.shift
     model.shift = lambda action: 4.2 * shift(action)  # it divides by the distance of another camera; here it is 1 m
     withheld = replace(far, point_world=far.point_world * np.nan)
-    controller = PixelController("sv2p", model, block.camera, planner(), **parts(block))
+    controller = PixelController(model, block.camera, planner(), **parts(block))
     controller.reset(block.observation(), withheld)
     np.testing.assert_allclose(controller.way(), far.point_world - POINT, atol=1e-3)  # a thing stays on the table
     servo(controller, block, withheld)
