@@ -10,8 +10,10 @@ import contextlib
 import ctypes
 import importlib
 import os
-from collections.abc import Callable
-from typing import Any
+import weakref
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from typing import Any, ClassVar
 
 from envs.errors import UsageError
 
@@ -39,7 +41,43 @@ def import_mujoco() -> None:
             os.environ["MUJOCO_GL"] = wish
 
 
-class EGLContext:
+class OffscreenContext(ABC):
+    """An OpenGL context that no window belongs to."""
+
+    backend: ClassVar[str]
+    """How it is made, as `MUJOCO_GL` names it."""
+    _context: int | None = None
+    _alive: ClassVar[weakref.WeakValueDictionary[int, OffscreenContext]] = weakref.WeakValueDictionary()
+
+    @abstractmethod
+    def make_current(self) -> None:
+        """Send this thread's OpenGL calls here."""
+
+    @abstractmethod
+    def gl_renderer(self) -> str:
+        """GL_RENDERER: what draws, e.g. `llvmpipe (LLVM 15.0.6, 256 bits)`."""
+
+    @abstractmethod
+    def free(self) -> None:
+        """Give the context back; it cannot be used afterwards."""
+
+    @abstractmethod
+    def _current(self) -> int | None:
+        """The context that this thread's OpenGL calls go to."""
+
+    @contextlib.contextmanager
+    def in_passing(self) -> Iterator[None]:
+        """Send this thread's OpenGL calls here in the block, and afterwards to where they went before."""
+        before = self._alive.get(self._current() or 0)
+        self.make_current()
+        try:
+            yield
+        finally:
+            if before is not None and before._context:  # the block may have freed it
+                before.make_current()
+
+
+class EGLContext(OffscreenContext):
     """A context on the first EGL device that works, or on the one that `MUJOCO_EGL_DEVICE_ID` names."""
 
     backend = "egl"
@@ -61,6 +99,7 @@ class EGLContext:
         if not self._context:
             raise RuntimeError("EGL makes no OpenGL context")
         self._egl.eglGetCurrentContext.restype = ctypes.c_void_p
+        self._alive[self._context] = self
         _show_to_mujoco(self._egl)
 
     def _initialised_display(self) -> int:
@@ -95,8 +134,7 @@ class EGLContext:
         return ctypes.CFUNCTYPE(result, *arguments)(address)
 
     def make_current(self) -> None:
-        """Send this thread's OpenGL calls here."""
-        if self._egl.eglGetCurrentContext() == self._context:
+        if self._current() == self._context:
             return
         display, context = ctypes.c_void_p(self._display), ctypes.c_void_p(self._context)
         self._egl.eglBindAPI(0x30A2)
@@ -104,21 +142,23 @@ class EGLContext:
             raise RuntimeError("this EGL context cannot be made current; is it in use in another thread?")
 
     def gl_renderer(self) -> str:
-        """GL_RENDERER: what draws, e.g. `llvmpipe (LLVM 15.0.6, 256 bits)`."""
         self.make_current()
         return _text(self._extension("glGetString", ctypes.c_char_p, ctypes.c_uint)(_GL_RENDERER))
 
     def free(self) -> None:
-        """Give the context back; it cannot be used afterwards."""
         if self._context:
             display = ctypes.c_void_p(self._display)
-            if self._egl.eglGetCurrentContext() == self._context:
+            if self._current() == self._context:
                 self._egl.eglMakeCurrent(display, None, None, None)
+            self._alive.pop(self._context, None)
             self._egl.eglDestroyContext(display, ctypes.c_void_p(self._context))
         self._context = None
 
+    def _current(self) -> int | None:
+        return self._egl.eglGetCurrentContext()
 
-class OSMesaContext:
+
+class OSMesaContext(OffscreenContext):
     """A context that draws in memory, in software, without any device."""
 
     backend = "osmesa"
@@ -131,32 +171,34 @@ class OSMesaContext:
         if not self._context:
             raise RuntimeError("OSMesa makes no context")
         self._buffer = (ctypes.c_ubyte * 4)()  # the default framebuffer, never drawn to: MuJoCo makes its own
+        self._alive[self._context] = self
         _show_to_mujoco(self._osmesa)
 
     def make_current(self) -> None:
-        """Send this thread's OpenGL calls here."""
-        if self._osmesa.OSMesaGetCurrentContext() == self._context:
+        if self._current() == self._context:
             return
         if not self._osmesa.OSMesaMakeCurrent(ctypes.c_void_p(self._context), self._buffer, 0x1401, 1, 1):
             raise RuntimeError("this OSMesa context cannot be made current")
 
     def gl_renderer(self) -> str:
-        """GL_RENDERER: what draws, e.g. `llvmpipe (LLVM 15.0.6, 256 bits)`."""
         self.make_current()
         self._osmesa.OSMesaGetProcAddress.restype = ctypes.c_void_p
         address = self._osmesa.OSMesaGetProcAddress(b"glGetString")
         return _text(ctypes.CFUNCTYPE(ctypes.c_char_p, ctypes.c_uint)(address)(_GL_RENDERER))
 
     def free(self) -> None:
-        """Give the context back; it cannot be used afterwards."""
         if self._context:
-            if self._osmesa.OSMesaGetCurrentContext() == self._context:
+            if self._current() == self._context:
                 self._osmesa.OSMesaMakeCurrent(None, None, 0, 0, 0)
+            self._alive.pop(self._context, None)
             self._osmesa.OSMesaDestroyContext(ctypes.c_void_p(self._context))
         self._context = None
 
+    def _current(self) -> int | None:
+        return self._osmesa.OSMesaGetCurrentContext()
 
-def create_context() -> EGLContext | OSMesaContext:
+
+def create_context() -> OffscreenContext:
     """The context to draw in: EGL, else OSMesa; only the one that `MUJOCO_GL` names where it names one.
 
     Raises:

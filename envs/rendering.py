@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from envs.camera import CameraModel
 from envs.errors import UsageError
-from envs.gl import EGLContext, OSMesaContext, create_context
+from envs.gl import OffscreenContext, create_context
 
 VISIBLE_GROUPS = (1, 2)
 """Geom groups that are drawn. Group 0 holds collision shapes (robosuite's habit), 3 and up hold aids and targets."""
@@ -23,8 +23,9 @@ VISIBLE_GROUPS = (1, 2)
 class StaticCamera:
     """A camera that stands still in a MuJoCo model and sees colour, depth and body ids.
 
-    The OpenGL context is made at the first picture, in the process that asks for it, and lives until `close`.
-    Sites, tendons, lights and other decoration are never drawn, nor are shadows, reflections, fog and haze.
+    The OpenGL context is made at the first picture, in the process and thread that ask for it, and lives until `close`.
+    A copy of a camera, also a pickled one, makes its own. Sites, tendons, lights and other decoration are never drawn,
+    nor are shadows, reflections, fog and haze.
 
     Args:
         model: the compiled model.
@@ -52,7 +53,7 @@ class StaticCamera:
         supersample: int = 3,
         visible_groups: Sequence[int] = VISIBLE_GROUPS,
     ) -> None:
-        if supersample < 1 or supersample % 2 == 0:
+        if not isinstance(supersample, (int, np.integer)) or supersample < 1 or supersample % 2 == 0:
             raise UsageError(f"supersample is {supersample!r}; give an odd number, so that a block has a centre sample")
         if not visible_groups or not set(visible_groups) <= set(range(mujoco.mjNGROUP)):
             raise UsageError(f"visible_groups is {visible_groups!r}; give numbers from 0 to {mujoco.mjNGROUP - 1}")
@@ -62,22 +63,8 @@ class StaticCamera:
         _check_clipping(model, self.geometry)
         self.supersample = supersample
 
-        large = (height * supersample, width * supersample)
-        self._viewport = mujoco.MjrRect(0, 0, large[1], large[0])
-        self._rgb = np.empty((*large, 3), np.uint8)
-        self._zbuffer = np.empty(large, np.float32)
-        self._option = mujoco.MjvOption()
-        for kind in ("geomgroup", "sitegroup", "jointgroup", "tendongroup", "actuatorgroup", "flexgroup", "skingroup"):
-            getattr(self._option, kind)[:] = 0
-        for group in visible_groups:
-            self._option.geomgroup[group] = self._option.flexgroup[group] = self._option.skingroup[group] = 1
-        self._view = mujoco.MjvCamera()
-        self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._view.fixedcamid = self._id
-        self._scene: mujoco.MjvScene | None = None
-        self._gl: EGLContext | OSMesaContext | None = None
-        self._mjr: Any = None
-        self._release: weakref.finalize | None = None
+        self._groups = tuple(visible_groups)
+        self._canvas: _Canvas | None = None
 
     def render(self, data: mujoco.MjData) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Colour and depth, from one and the same pass.
@@ -90,14 +77,13 @@ class StaticCamera:
             depth: (height, width) float32, planar, metres, at the pixel centres, clipped to [near, far].
 
         Raises:
-            UsageError: no OpenGL works.
+            UsageError: no OpenGL works, or it draws no picture so large.
         """
-        scene = self._draw(data)
-        mujoco.mjr_readPixels(self._rgb, self._zbuffer, self._viewport, self._mjr)
-        frustum = scene.camera[0]
-        depth = metric_depth(self._centre_samples(self._zbuffer), frustum.frustum_near, frustum.frustum_far)
+        canvas = self._ensure_canvas()
+        frustum = canvas.draw(data).camera[0]
+        depth = metric_depth(self._centre_samples(canvas.zbuffer), frustum.frustum_near, frustum.frustum_far)
         depth = np.clip(depth, self.geometry.near, self.geometry.far)
-        rgb = block_average(self._rgb, self.supersample)
+        rgb = block_average(canvas.rgb, self.supersample)
         return rgb[::-1].copy(), depth[::-1].astype(np.float32)
 
     def segment(self, data: mujoco.MjData) -> NDArray[np.int32]:
@@ -110,11 +96,11 @@ class StaticCamera:
             (height, width) int32 body ids; 0 is the world, and where nothing is.
 
         Raises:
-            UsageError: no OpenGL works.
+            UsageError: no OpenGL works, or it draws no picture so large.
         """
-        scene = self._draw(data, ids=True)
-        mujoco.mjr_readPixels(self._rgb, None, self._viewport, self._mjr)
-        samples = self._centre_samples(self._rgb).astype(np.int32)[::-1]
+        canvas = self._ensure_canvas()
+        scene = canvas.draw(data, ids=True)
+        samples = self._centre_samples(canvas.rgb).astype(np.int32)[::-1]
         segment_id = samples[..., 0] | samples[..., 1] << 8 | samples[..., 2] << 16  # 0: nothing drawn
         body_of = np.zeros(scene.ngeom + 1, np.int32)
         for geom in scene.geoms[: scene.ngeom]:
@@ -128,14 +114,17 @@ class StaticCamera:
         Raises:
             UsageError: no OpenGL works.
         """
-        gl = self._ensure_context()[0]
+        gl = self._ensure_canvas().gl
         return f"{gl.backend}: {gl.gl_renderer()}"
 
     def close(self) -> None:
         """Give the OpenGL context back. The camera may still be used: the next picture makes a new one."""
-        if self._release is not None:
-            self._release()
-        self._gl = self._mjr = self._scene = self._release = None
+        if self._canvas is not None:
+            self._canvas.free()
+        self._canvas = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_canvas": None}
 
     def __enter__(self) -> StaticCamera:
         return self
@@ -145,31 +134,60 @@ class StaticCamera:
     ) -> None:
         self.close()
 
-    def _ensure_context(self) -> tuple[EGLContext | OSMesaContext, mujoco.MjvScene]:
-        if self._gl is None or self._scene is None:
-            self._gl = create_context()
-            self._gl.make_current()
-            self._mjr = _offscreen_renderer(self._model, self._viewport)
-            self._release = weakref.finalize(self, _free, self._gl, self._mjr, os.getpid())
-            self._scene = mujoco.MjvScene(self._model, maxgeom=self._model.ngeom + self._model.nskin + 64)
-            unwanted = mujoco.mjtRndFlag
-            for flag in (unwanted.mjRND_SHADOW, unwanted.mjRND_REFLECTION, unwanted.mjRND_FOG, unwanted.mjRND_HAZE):
-                self._scene.flags[flag] = False
-        return self._gl, self._scene
-
-    def _draw(self, data: mujoco.MjData, ids: bool = False) -> mujoco.MjvScene:
-        gl, scene = self._ensure_context()
-        gl.make_current()
-        physical = mujoco.mjtCatBit.mjCAT_STATIC | mujoco.mjtCatBit.mjCAT_DYNAMIC
-        mujoco.mjv_updateScene(self._model, data, self._option, None, self._view, physical, scene)
-        scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = ids
-        scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = ids
-        mujoco.mjr_render(self._viewport, scene, self._mjr)
-        return scene
+    def _ensure_canvas(self) -> _Canvas:
+        if self._canvas is None:
+            large = self.geometry.width * self.supersample, self.geometry.height * self.supersample
+            self._canvas = _Canvas(self._model, self._id, *large, self._groups)
+        return self._canvas
 
     def _centre_samples(self, image: NDArray[Any]) -> NDArray[Any]:
         middle = self.supersample // 2
         return image[middle :: self.supersample, middle :: self.supersample]
+
+
+class _Canvas:
+    """An OpenGL context, and what MuJoCo draws in it of a model as a camera sees it.
+
+    Raises:
+        UsageError: no OpenGL works, or it draws no picture so large.
+    """
+
+    def __init__(self, model: mujoco.MjModel, camera: int, width: int, height: int, groups: tuple[int, ...]) -> None:
+        self.gl = create_context()
+        self.gl.make_current()
+        self._viewport = mujoco.MjrRect(0, 0, width, height)
+        try:
+            self._mjr = _offscreen_renderer(model, self._viewport)
+        except UsageError:
+            self.gl.free()
+            raise
+        self.free = weakref.finalize(self, _free, self.gl, self._mjr, os.getpid())
+        self._model = model
+        self.rgb = np.empty((height, width, 3), np.uint8)
+        self.zbuffer = np.empty((height, width), np.float32)
+        self._option = mujoco.MjvOption()
+        for kind in ("geomgroup", "sitegroup", "jointgroup", "tendongroup", "actuatorgroup", "flexgroup", "skingroup"):
+            getattr(self._option, kind)[:] = 0
+        for group in groups:
+            self._option.geomgroup[group] = self._option.flexgroup[group] = self._option.skingroup[group] = 1
+        self._view = mujoco.MjvCamera()
+        self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._view.fixedcamid = camera
+        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + model.nskin + 64)
+        unwanted = mujoco.mjtRndFlag
+        for flag in (unwanted.mjRND_SHADOW, unwanted.mjRND_REFLECTION, unwanted.mjRND_FOG, unwanted.mjRND_HAZE):
+            self._scene.flags[flag] = False
+
+    def draw(self, data: mujoco.MjData, ids: bool = False) -> mujoco.MjvScene:
+        """Draw colour and depth into `rgb` and `zbuffer`, bottom row first, or ids as colours into `rgb` alone."""
+        self.gl.make_current()
+        physical = mujoco.mjtCatBit.mjCAT_STATIC | mujoco.mjtCatBit.mjCAT_DYNAMIC
+        mujoco.mjv_updateScene(self._model, data, self._option, None, self._view, physical, self._scene)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = ids
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = ids
+        mujoco.mjr_render(self._viewport, self._scene, self._mjr)
+        mujoco.mjr_readPixels(self.rgb, None if ids else self.zbuffer, self._viewport, self._mjr)
+        return self._scene
 
 
 def block_average(image: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
@@ -237,7 +255,11 @@ def _check_clipping(model: mujoco.MjModel, camera: CameraModel) -> None:
 
 
 def _offscreen_renderer(model: mujoco.MjModel, viewport: mujoco.MjrRect) -> Any:
-    """MuJoCo's renderer, with a framebuffer of this size, on the current OpenGL context; the model stays as it was."""
+    """MuJoCo's renderer, with a framebuffer of this size, on the current OpenGL context; the model stays as it was.
+
+    Raises:
+        UsageError: OpenGL makes no framebuffer so large.
+    """
     settings = (
         (model.vis.global_, "offwidth", viewport.width),
         (model.vis.global_, "offheight", viewport.height),
@@ -249,6 +271,11 @@ def _offscreen_renderer(model: mujoco.MjModel, viewport: mujoco.MjrRect) -> Any:
         for owner, name, value in settings:
             setattr(owner, name, value)
         renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
+    except mujoco.FatalError as error:
+        raise UsageError(
+            f"OpenGL does not draw {viewport.width} x {viewport.height} samples ({error}); give a smaller image size "
+            "or supersample"
+        ) from error
     finally:
         for (owner, name, _), value in zip(settings, before, strict=True):
             setattr(owner, name, value)
@@ -257,8 +284,8 @@ def _offscreen_renderer(model: mujoco.MjModel, viewport: mujoco.MjrRect) -> Any:
     return renderer
 
 
-def _free(gl: EGLContext | OSMesaContext, renderer: Any, process: int) -> None:
+def _free(gl: OffscreenContext, renderer: Any, process: int) -> None:
     if os.getpid() == process:  # a forked child must not touch its parent's context
-        gl.make_current()
-        renderer.free()
-        gl.free()
+        with gl.in_passing():  # Python's garbage collector may come here in the midst of another camera's picture
+            renderer.free()
+            gl.free()

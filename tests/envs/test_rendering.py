@@ -1,7 +1,10 @@
 """The static camera against known geometry, under every OpenGL that there is."""
 
+import copy
 import ctypes
+import gc
 import os
+import pickle
 import subprocess
 import sys
 
@@ -118,7 +121,7 @@ def test_every_pixel_shows_what_its_ray_hits(world, make_camera):
 def run_known_geometry(backend):
     environment = os.environ | {"MUJOCO_GL": backend}
     command = [sys.executable, "-m", "pytest", "-o", "addopts=--import-mode=importlib", "-p", "no:cacheprovider"]
-    command += ["-k", "known_geometry or renderer_is", __file__]
+    command += ["-k", "known_geometry or renderer_is or garbage", __file__]
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=200)
 
 
@@ -130,7 +133,7 @@ def test_both_backends_agree_with_geometry(backend, library):
         pytest.skip(f"{library} is not installed, so {backend} cannot be tested; {gl.REMEDY}")
     result = run_known_geometry(backend)
     assert result.returncode == 0, result.stdout + result.stderr
-    assert "13 passed" in result.stdout
+    assert "14 passed" in result.stdout
 
 
 def test_renderer_is_the_one_asked_for(world, make_camera):
@@ -223,6 +226,45 @@ def test_pictures_are_repeatable_independent_and_survive_close(world, make_camer
         assert all(np.array_equal(image, copy) for image, copy in zip(pictures, kept, strict=True))
 
 
+def test_a_camera_that_becomes_garbage_while_another_draws_leaves_its_picture_alone(world, make_camera, monkeypatch):
+    model, data = world
+    camera, update = make_camera(), mujoco.mjv_updateScene
+    expected = camera.render(data)
+    moved = copy.copy(data)
+    moved.qpos[2] += 0.2
+    mujoco.mj_forward(model, moved)
+    assert not np.array_equal(camera.render(moved)[0], expected[0])
+
+    def collect_first(*arguments):
+        gc.collect()
+        update(*arguments)
+
+    dropped = StaticCamera(model, "wide", 16, 16, 0.1, 6.0)
+    dropped.render(data)
+    dropped.itself = dropped  # only the garbage collector frees it
+    del dropped
+    monkeypatch.setattr(mujoco, "mjv_updateScene", collect_first)
+    for picture, wanted in zip(camera.render(data), expected, strict=True):
+        np.testing.assert_array_equal(picture, wanted)
+
+
+def test_a_camera_that_has_drawn_can_be_copied_and_pickled(world, make_camera):
+    _, data = world
+    camera = make_camera("wide", 33, 21)
+    expected = camera.render(data)
+    for other in (copy.deepcopy(camera), pickle.loads(pickle.dumps(camera))):
+        with other:
+            assert all(map(np.array_equal, other.render(data), expected))
+    assert all(map(np.array_equal, camera.render(data), expected))
+
+
+def test_a_picture_beyond_what_opengl_draws_is_named_and_another_camera_goes_on(world, make_camera):
+    _, data = world
+    with pytest.raises(UsageError, match=r"120000 x 120000 samples.*smaller image size"):
+        make_camera(width=40_000, height=40_000).render(data)
+    make_camera().render(data)
+
+
 def test_the_model_is_left_as_it_was_whatever_the_picture_size(world, make_camera):
     model, data = world
     camera = make_camera(width=900, height=700, supersample=1)  # beyond MuJoCo's default framebuffer of 640x480
@@ -312,6 +354,7 @@ print(os.environ["MUJOCO_GL"], mujoco.MjModel.from_xml_string("<mujoco/>").nbody
     ("arguments", "message"),
     [
         ({"supersample": 2}, "supersample is 2"),
+        ({"supersample": 1.5}, "supersample is 1.5; give an odd number"),
         ({"name": "nowhere"}, "no camera 'nowhere'.*narrow"),
         ({"near": 0.001}, "clipped to 0.01 .. 50 m"),
         ({"far": 60.0}, "clipped to 0.01 .. 50 m"),
