@@ -69,8 +69,8 @@ class RGBDEnv(gymnasium.Env, ABC):
         self.render_mode, self.images = render_mode, images
         self.mj_model, self.mj_data = model, mujoco.MjData(model)
         self._supersample = supersample
-        self._cameras: dict[tuple[str, int], StaticCamera] = {}
         self._camera = self._make_camera("static", image_size)
+        self._views: dict[str, StaticCamera] = {}
         self._picture: Picture | None = None
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (action_size,), np.float32)
         self.observation_space = gymnasium.spaces.Dict({**self._picture_spaces(), **measurements})
@@ -86,7 +86,7 @@ class RGBDEnv(gymnasium.Env, ABC):
 
     def close(self) -> None:
         """Give the OpenGL contexts back."""
-        for camera in self._cameras.values():
+        for camera in (self._camera, *self._views.values()):
             camera.close()
 
     # --- What others build on --------------------------------------------------------------------------------------
@@ -129,12 +129,18 @@ class RGBDEnv(gymnasium.Env, ABC):
     def view(self, name: str = "side", size: int = 256) -> NDArray[np.uint8]:
         """A picture (size, size, 3) uint8 from the camera `static` or `side`, for people to look at.
 
+        It is quickest at the size of the view's last picture, for which there is an OpenGL context.
+
         Raises:
-            UsageError: no such camera.
+            UsageError: no such camera, or OpenGL draws no picture so large.
         """
         if name not in self.DEPTH_RANGES:
             raise UsageError(f"there is no view {name!r}; choose one of {', '.join(self.DEPTH_RANGES)}")
-        return self._make_camera(name, size).render(self._shown_in(name))[0]
+        if name in self._views and self._views[name].geometry.height != size:
+            self._views.pop(name).close()
+        if name not in self._views:
+            self._views[name] = self._make_camera(name, size)
+        return self._views[name].render(self._shown_in(name))[0]
 
     def get_state(self) -> NDArray[np.float64]:
         """Everything that the future depends on, but the random generator, which only `reset` uses: 1-D float64.
@@ -217,12 +223,10 @@ class RGBDEnv(gymnasium.Env, ABC):
         return self._picture
 
     def _make_camera(self, name: str, size: int) -> StaticCamera:
-        if (name, size) not in self._cameras:
-            (near, far), groups = self.DEPTH_RANGES[name], self._visible_groups(name)
-            self._cameras[name, size] = StaticCamera(
-                self.mj_model, name, size, size, near, far, supersample=self._supersample, visible_groups=groups
-            )
-        return self._cameras[name, size]
+        (near, far), groups = self.DEPTH_RANGES[name], self._visible_groups(name)
+        return StaticCamera(
+            self.mj_model, name, size, size, near, far, supersample=self._supersample, visible_groups=groups
+        )
 
     def _picture_spaces(self) -> dict[str, gymnasium.Space]:
         if not self.images:

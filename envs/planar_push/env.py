@@ -81,10 +81,12 @@ class PlanarPushEnv(RGBDEnv):
         Args:
             seed: makes everything that follows repeatable.
             options: any of `object` (its name), `pose` ([x, y, yaw] of the object, m and rad), `tip` ([x, y], m) and
-                `hidden` (a `Hidden`, or its vector); what is given is not drawn.
+                `hidden` (a `Hidden`, or its vector); what is given is not drawn. With `pose` but no `tip` the tip is as
+                far from the object as it was drawn, and on the same side if it fits there.
 
         Raises:
-            UsageError: an unknown option, a value that does not fit, or a tip inside of the object.
+            UsageError: an unknown option, a value that does not fit, a tip inside of the object, or a pose that leaves
+                it no place.
         """
         super().reset(seed=seed)
         start = placement.draw(self.objects, self.np_random).with_options(self._check_options(options))

@@ -18,6 +18,8 @@ from envs.planar_push.scene import TIP_RADIUS
 
 OBJECT_AREA = 0.07  # m, half the side of the square that the object's middle starts in
 TIP_DISTANCE = (0.10, 0.16)  # m, from the middle of the object
+BEARINGS = 2  # a stream of its own, beside those of the environment's noise
+TRIES = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +38,7 @@ class Start:
         """With what the options of `PlanarPushEnv.reset` say instead of what was drawn.
 
         Raises:
-            UsageError: a value that does not fit, or the tip is inside of the object.
+            UsageError: a value that does not fit, or the tip is inside of the object, or has no place beside it.
         """
         changes: dict[str, Any] = {}
         if "object" in options:
@@ -50,12 +52,26 @@ class Start:
         if "tip" in options:
             changes["tip"] = _numbers("tip", options["tip"], 2)
         start = dataclasses.replace(self, **changes)
+        if "pose" in options and "tip" not in options:
+            return start._with_tip_beside()
         if (start.tip < WORKSPACE_LOW).any() or (start.tip > WORKSPACE_HIGH).any():
             low, high = WORKSPACE_LOW.tolist(), WORKSPACE_HIGH.tolist()
             raise UsageError(f"the tip would start at {start.tip.tolist()}; choose tip between {low} and {high}")
         if start.clearance() < 0:
             raise UsageError(f"tip {start.tip.tolist()} is inside of the object; choose a place beside it")
         return start
+
+    def _with_tip_beside(self) -> Start:
+        """With the tip elsewhere around the object, as far from it, if it does not fit where it is."""
+        middle = self.pose[:2]
+        distance = np.linalg.norm(self.tip - middle)
+        bearings = np.random.default_rng((self.noise_seed, 0, BEARINGS)).uniform(-np.pi, np.pi, TRIES)
+        around = middle + distance * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+        for tip in (self.tip, *around):
+            start = dataclasses.replace(self, tip=tip)
+            if (tip >= WORKSPACE_LOW).all() and (tip <= WORKSPACE_HIGH).all() and start.clearance() >= 0:
+                return start
+        raise UsageError(f"pose {self.pose.tolist()} leaves the tip no place beside the object; choose one nearer to 0")
 
     def clearance(self) -> float:
         """Free space between tip and object, metres."""

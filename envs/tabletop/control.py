@@ -18,7 +18,7 @@ from envs.tabletop.scene import CONTROL_RATE
 ACTION_SCALE = (0.02, 0.02, 0.02, 0.05, 0.05, 0.05, 1.0)  # m, rad, sign
 ACTION_AGGREGATION = ("sum", "sum", "sum", "rotate", "rotate", "rotate", "last")
 SIGNS = (6,)  # the gripper
-WORKSPACE_LOW, WORKSPACE_HIGH = np.array([-0.32, -0.46, 0.30]), np.array([0.34, 0.10, 0.78])  # m, of the target
+WORKSPACE_LOW, WORKSPACE_HIGH = np.array([-0.32, -0.46, 0.30]), np.array([0.34, 0.10, 0.78])  # m, see `advance`
 MAX_LEAD, MAX_TURN_LEAD = 0.03, 0.10  # m, rad: how far the target may be from the measured pose
 
 Array = NDArray[np.float64]
@@ -50,7 +50,8 @@ def advance(target: Pose, tcp: Pose, actions: Array) -> Pose:
         actions: (..., 7) in [-1, 1]; increments along and about the world's axes.
 
     Returns:
-        The new target pose, inside the workspace, and at most MAX_LEAD and MAX_TURN_LEAD from the measured pose.
+        The new target pose, at most MAX_LEAD and MAX_TURN_LEAD from the measured pose. Its position is clipped to the
+        workspace before it is drawn to within MAX_LEAD: where the measured pose is outside, the target may be, too.
     """
     scaled = actions * np.array(ACTION_SCALE)
     position = np.clip(target.position + scaled[..., :3], WORKSPACE_LOW, WORKSPACE_HIGH)

@@ -130,7 +130,7 @@ class TabletopEnv(RGBDEnv):
 
     @property
     def workspace(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lowest and highest corner (3,) of the box that the target position stays in, metres."""
+        """Lowest and highest corner (3,) of the box that the target position is clipped to, metres."""
         return control.WORKSPACE_LOW.copy(), control.WORKSPACE_HIGH.copy()
 
     @property

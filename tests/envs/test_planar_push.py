@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+import gc
 import hashlib
 import itertools
+import pickle
 
 import gymnasium
 import mujoco
@@ -14,6 +17,7 @@ from gymnasium.utils.env_checker import check_env
 
 import envs  # noqa: F401  (registers)
 from envs.errors import UsageError
+from envs.gl import OffscreenContext
 from envs.planar_push import PlanarPushEnv, control, objects, pieces
 from envs.planar_push.hidden import Hidden
 from envs.planar_push.scene import TIP_RADIUS
@@ -138,6 +142,29 @@ def test_render_modes_and_sizes():
         env.close()
 
 
+def test_views_of_many_sizes_hold_one_context():
+    env = PlanarPushEnv(images=False)
+    env.reset(seed=0)
+    gc.collect()
+    before = len(OffscreenContext._alive)
+    assert [env.view("side", size).shape for size in (32, 48, 32)] == [(32, 32, 3), (48, 48, 3), (32, 32, 3)]
+    assert len(OffscreenContext._alive) == before + 1
+    env.close()
+    assert len(OffscreenContext._alive) == before
+
+
+def test_an_environment_that_has_drawn_can_be_copied_and_pickled():
+    env = PlanarPushEnv()
+    env.reset(seed=3)
+    copies = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    observation = env.step([1, 0, 0])[0]
+    for other in copies:
+        for name, values in other.step([1, 0, 0])[0].items():
+            np.testing.assert_array_equal(values, observation[name])
+        other.close()
+    env.close()
+
+
 def test_the_tip_is_where_the_camera_sees_it():
     env = PlanarPushEnv(image_size=96, supersample=1)
     for corner in itertools.product((-0.24, 0.24), repeat=2):
@@ -162,6 +189,23 @@ def test_seeds_are_exact_and_starts_are_varied_and_free(blind):
         assert not any(blind.mj_model.geom("tip").id in contact.geom for contact in blind.mj_data.contact)
         assert np.abs(blind.mj_data.qvel).max() < 5e-3  # everything stands
     assert (np.ptp(seen, axis=0) > [0.05, 0.05, 1, 20, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]).all()
+
+
+def test_a_pose_of_ones_choice_gets_a_tip_beside_it(blind):
+    redrawn = 0
+    for seed in range(40):
+        blind.reset(seed=seed)
+        drawn = blind.tip_position - blind.object_pose[:2]
+        blind.reset(seed=seed, options={"pose": [0.15, 0.1, 0.5]})
+        offset = blind.tip_position - [0.15, 0.1]
+        assert np.abs(blind.tip_position).max() <= 0.24 + 1e-6
+        assert np.linalg.norm(offset) == pytest.approx(np.linalg.norm(drawn), abs=1e-3)
+        np.testing.assert_allclose(blind.object_pose, [0.15, 0.1, 0.5], atol=1e-3)
+        redrawn += not np.allclose(offset, drawn, atol=1e-3)
+        tip = blind.tip_position
+        blind.reset(seed=seed, options={"pose": [0.15, 0.1, 0.5]})
+        np.testing.assert_array_equal(blind.tip_position, tip)
+    assert 5 < redrawn < 35  # where the tip that was drawn fits, it stays
 
 
 def test_a_restored_state_goes_on_to_the_last_bit_also_on_another_object(blind):
@@ -327,6 +371,7 @@ def test_bad_input_is_named(blind):
         (lambda: blind.set_state(np.zeros(3)), r"\(3,\)"),
         (lambda: blind.reset(options={"arm": 1}), "arm"),
         (lambda: blind.reset(options={"pose": [0, 0]}), "pose"),
+        (lambda: blind.reset(options={"pose": [0.5, 0, 0]}), r"pose \[0.5, 0.0, 0.0\] leaves the tip no place"),
         (lambda: blind.reset(options={"tip": [0.3, 0]}), "0.3"),
         (lambda: blind.reset(options={"pose": [0, 0, 0], "tip": [0.01, 0]}), "inside"),
         (lambda: blind.reset(options={"hidden": [1, 2]}), r"\(2,\)"),
