@@ -20,10 +20,10 @@ from data_collection.schema import (
     GROUND_TRUTH,
     MEANING,
     SHARD_PATTERN,
-    DamagedShard,
     Shard,
     dequantise_depth,
     read_shard,
+    unreadable,
 )
 from envs.camera import CameraModel
 from envs.errors import UsageError
@@ -260,7 +260,7 @@ def _camera_of(shard: Shard) -> CameraModel:
 
 
 class _reading:
-    """A shard open for reading; what HDF5 cannot read is a damaged shard."""
+    """A shard open for reading; what cannot be read is told as `unreadable` does."""
 
     def __init__(self, shard: Shard) -> None:
         self._shard = shard
@@ -269,10 +269,10 @@ class _reading:
         try:
             self._file = h5py.File(self._shard.path, "r")
         except OSError as error:
-            raise DamagedShard(self._shard.path, str(error)) from error
+            raise unreadable(self._shard.path, error) from error
         return self._file
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._file.close()
         if isinstance(error, OSError | RuntimeError):
-            raise DamagedShard(self._shard.path, str(error)) from error
+            raise unreadable(self._shard.path, error) from error

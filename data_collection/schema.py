@@ -21,8 +21,11 @@ shard-00007.h5
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +39,8 @@ from envs.errors import UsageError
 
 SCHEMA_VERSION = 1
 SHARD_PATTERN = "shard-*.h5"
+ERRNO = re.compile(r"errno = (\d+)")  # in what HDF5 says, of errors that are not its own
+ABOUT_CONTENT = (errno.EINVAL, errno.EOVERFLOW)  # a damaged file may send its reader to places that no file has
 DEPTH_STEPS = 65535  # the largest uint16
 
 
@@ -142,8 +147,9 @@ def read_shard(path: Path) -> Shard:
     """Read and check a shard's tables and attributes; the columns' values are left alone.
 
     Raises:
-        DamagedShard: it does not open, or its tables and columns are missing or disagree.
-        UsageError: it was written in another version of the schema, or without an attribute.
+        DamagedShard: HDF5 makes nothing of it, or its tables and columns are missing or disagree.
+        UsageError: the system does not let it be read, or it was written in another version of the schema, or without
+            an attribute.
     """
     try:
         with h5py.File(path, "r") as file:
@@ -155,7 +161,7 @@ def read_shard(path: Path) -> Shard:
     except (OSError, KeyError, RuntimeError, ValueError) as error:
         if isinstance(error, UsageError):
             raise
-        raise DamagedShard(path, _first_line(error)) from error
+        raise unreadable(path, error) from error
     for name in EPISODE_TABLES:
         if name not in tables:
             raise DamagedShard(path, f"no table '{name}'")
@@ -176,6 +182,18 @@ def read_shard(path: Path) -> Shard:
             raise DamagedShard(path, f"column '{name}' has {shape[0] if shape else 0} rows, its episodes {rows}")
     rest = {name: shape[1:] for name, (shape, _) in columns.items()}
     return Shard(path, rest, **tables, ep_terminated=terminated, attrs=attrs)
+
+
+def unreadable(path: Path, error: Exception) -> UsageError:
+    """What to raise where a shard cannot be read: a `DamagedShard` only if it is the content that HDF5 cannot read.
+
+    A shard without permission, one that another program has locked, or one file too many may well be whole.
+    """
+    told = ERRNO.search(str(error))
+    number = getattr(error, "errno", None) or (int(told[1]) if told else None)
+    if number is None or number in ABOUT_CONTENT:
+        return DamagedShard(path, _first_line(error))
+    return UsageError(f"{path} cannot be read: {os.strerror(number)}; mend that and try again, it may well be whole")
 
 
 def _read_attributes(path: Path, file: h5py.File) -> dict[str, Any]:

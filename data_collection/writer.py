@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 
 from data_collection.attributes import complete_attributes
 from data_collection.files import written_aside
-from data_collection.schema import COLUMNS, Shard, encode_attributes, episode_hash, read_shard
+from data_collection.schema import (
+    COLUMNS,
+    DamagedShard,
+    Shard,
+    encode_attributes,
+    episode_hash,
+    read_shard,
+    unreadable,
+)
 
 CHUNK_BYTES = 1 << 19  # a chunk is a run of frames of one clip; half a megabyte stays in the cache while it is unpacked
 
@@ -85,6 +93,7 @@ def intact_episodes(path: Path) -> tuple[Shard, list[bool]]:
 
     Raises:
         DamagedShard: the shard does not open.
+        UsageError: the system does not let it be read.
     """
     shard = read_shard(path)
     return shard, [_is_intact(shard, number) for number in range(len(shard.ep_len))]
@@ -93,7 +102,10 @@ def intact_episodes(path: Path) -> tuple[Shard, list[bool]]:
 def _is_intact(shard: Shard, number: int) -> bool:
     try:
         return bool(np.array_equal(episode_hash(read_episode(shard, number)), shard.ep_hash[number]))
-    except (OSError, RuntimeError):  # a chunk that does not unpack
+    except (OSError, KeyError, RuntimeError) as error:  # a chunk that does not unpack
+        told = unreadable(shard.path, error)
+        if not isinstance(told, DamagedShard):
+            raise told from error
         return False
 
 

@@ -1,6 +1,8 @@
 """What is written comes back, and what is wrong is named."""
 
+import errno
 import multiprocessing
+import os
 import pickle
 import shutil
 
@@ -11,9 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shards import ATTRS, CAMERA, flip_a_byte_of, make_episode
 
+from data_collection import writer
 from data_collection.dataset import RGBDDataset
 from data_collection.schema import DEPTH_STEPS, DamagedShard, dequantise_depth, episode_hash, quantise_depth, read_shard
-from data_collection.writer import read_episode, write_shard
+from data_collection.writer import intact_episodes, read_episode, write_shard
 from envs.errors import UsageError
 
 
@@ -169,6 +172,29 @@ def test_damaged_chunk_is_named_when_read(folder):
     for read in (lambda: dataset.load("rgb"), lambda: dataset.episode(2)):
         with pytest.raises(DamagedShard, match=r"shard-00001\.h5"):
             read()
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EMFILE, errno.EIO])
+def test_a_shard_that_the_system_does_not_let_be_read_is_not_damaged(folder, monkeypatch, number):
+    dataset, path = RGBDDataset(folder), folder / "shard-00001.h5"
+
+    def refuse(*_):
+        raise OSError(number, f"Unable to synchronously open file (errno = {number})")
+
+    monkeypatch.setattr(h5py, "File", refuse)
+    for read in (lambda: read_shard(path), lambda: dataset.load("rgb"), lambda: intact_episodes(path)):
+        with pytest.raises(UsageError, match=rf"shard-0000\d\.h5 cannot be read: {os.strerror(number)}") as caught:
+            read()
+        assert not isinstance(caught.value, DamagedShard)
+
+
+def test_a_disk_that_fails_while_a_column_is_read_is_no_other_episode(folder, monkeypatch):
+    def fail(*_):
+        raise KeyError("Unable to synchronously open object (file read failed: errno = 5)")  # as HDF5 has it
+
+    monkeypatch.setattr(writer, "read_episode", fail)
+    with pytest.raises(UsageError, match=r"shard-00001\.h5 cannot be read: Input/output error"):
+        intact_episodes(folder / "shard-00001.h5")
 
 
 def test_other_schema_version(folder):
