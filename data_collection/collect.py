@@ -144,7 +144,6 @@ def _collect(config: Config, manifest: Manifest, missing: list[int]) -> Iterator
 
 def _begin(manifest: Manifest, folder: Path) -> None:
     """Check that the folder is new or of the same run, and that what it has is whole."""
-    remove_leftovers(folder)
     before = read_manifest(folder)
     shards = sorted(folder.glob(SHARD_PATTERN))
     if before is None:
@@ -152,6 +151,7 @@ def _begin(manifest: Manifest, folder: Path) -> None:
             raise UsageError(f"{folder} has shards but no {MANIFEST_NAME}; choose another --out")
     elif shards:  # without any, as after options that did not work, there is nothing to go on with
         manifest.check_continues(before, folder)
+    remove_leftovers(folder)
     now = versions()  # once: it reads all of the source
     makers = [read_shard(shard).attrs["versions"] for shard in shards]
     if any(maker != now for maker in makers):

@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import json
 import os
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,14 +15,15 @@ from typing import Any
 from envs.errors import UsageError
 
 LOCK_NAME = ".lock"
+ASIDE = re.compile(r".+\.\d+\.tmp")  # what `written_aside` calls a file, with the number of its process
 
 
 @contextlib.contextmanager
 def written_aside(path: Path) -> Iterator[Path]:
     """Give the path of a temporary file that takes the place of `path` when the block ends well.
 
-    The temporary name carries the process id, so that two processes never write into the same file. An exception in
-    the block removes it; a killed process leaves a `*.tmp` that `remove_leftovers` clears.
+    The temporary name, NAME.<pid>.tmp, carries the process id, so that two processes never write into the same file. An
+    exception in the block removes it; what a killed process leaves, `remove_leftovers` clears.
     """
     aside = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
@@ -41,12 +43,14 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def remove_leftovers(folder: Path) -> list[str]:
-    """Remove the temporary files of killed writers; hold the folder's lock before calling.
+    """Remove the temporary files of killed writers, and nothing else that ends in `.tmp`.
+
+    Hold the folder's lock before calling, and know that it is a folder of ours.
 
     Returns:
         the names of what was removed.
     """
-    leftovers = sorted(folder.glob("*.tmp"))
+    leftovers = sorted(path for path in folder.iterdir() if ASIDE.fullmatch(path.name) and path.is_file())
     for leftover in leftovers:
         leftover.unlink(missing_ok=True)
     return [leftover.name for leftover in leftovers]

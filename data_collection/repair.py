@@ -38,11 +38,13 @@ def repair(folder: Path) -> list[str]:
         one line for each thing done; `collect-rollouts` makes dropped episodes again.
 
     Raises:
-        UsageError: the folder is missing, a collector is writing to it, or a shard is whole but its writer left out
-            attributes or gave some that do not fit.
+        UsageError: the folder is missing or has no shards, a collector is writing to it, the system does not let a
+            shard be read, or a shard is whole but its writer left out attributes or gave some that do not fit.
     """
     if not folder.is_dir():
         raise UsageError(f"no dataset folder {folder}; give the folder that collect-rollouts wrote")
+    if not any(folder.glob(SHARD_PATTERN)):
+        raise UsageError(f"no {SHARD_PATTERN} in {folder}; give the folder that collect-rollouts wrote")
     with locked(folder):
         report = [f"removed {name}, left by a killed writer" for name in remove_leftovers(folder)]
         for path in sorted(folder.glob(SHARD_PATTERN)):

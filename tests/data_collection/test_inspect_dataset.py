@@ -3,10 +3,12 @@
 import json
 import shutil
 
+import h5py
 import imageio.v2 as imageio
 import numpy as np
 import pytest
-from commands import assert_one_line_error, call, options
+from commands import assert_one_line_error, call, finish, options, start
+from layouts import write_omnipush
 from shards import ATTRS, flip_a_byte_of, make_episode
 
 from data_collection.dataset import RGBDDataset
@@ -101,6 +103,43 @@ def test_intact_episodes_of_a_damaged_shard_are_kept(tmp_path):
     dataset = RGBDDataset(tmp_path)
     assert dataset.episode_indices.tolist() == [5] and dataset.episode_terminated.tolist() == [True]
     np.testing.assert_array_equal(episode_hash(dataset.episode(0)), episode_hash(episodes[1]))
+
+
+def test_repair_leaves_a_shard_alone_that_another_program_has_open(folder):
+    before = sorted(folder.iterdir())
+    with h5py.File(folder / "shard-00001.h5", "r+"):
+        result = finish(start("inspect-dataset", [folder, "--repair", "--no-pictures"]))
+    assert_one_line_error(result, "shard-00001.h5 cannot be read", "temporarily unavailable")
+    assert sorted(folder.glob("[!.]*")) == [path for path in before if path.name[0] != "."]
+    assert not find_damage(folder)
+
+
+@pytest.mark.parametrize("command", ["collect-rollouts", "inspect-dataset", "import-dataset"])
+def test_a_folder_that_is_none_of_ours_keeps_what_it_has(tmp_path, command):
+    for name in ("shard.h5.tmp", "notes.tmp", "notes.txt.12.tmp"):
+        (tmp_path / name).touch()
+    if command != "inspect-dataset":
+        (tmp_path / "shard-00000.h5").touch()
+    there = sorted(path.name for path in tmp_path.iterdir())
+    source = write_omnipush(tmp_path.parent / f"{tmp_path.name}-source")
+    arguments = {
+        "collect-rollouts": options(tmp_path),
+        "inspect-dataset": [tmp_path, "--repair"],
+        "import-dataset": ["--format", "omnipush", "--image-size", "16", source, tmp_path],
+    }
+    assert_one_line_error(call(command, arguments[command]), str(tmp_path))
+    assert sorted(path.name for path in tmp_path.iterdir() if path.name != ".lock") == there
+
+
+def test_only_our_own_leftovers_are_removed(folder):
+    (folder / "work.tmp").mkdir()
+    (folder / "work.12.tmp").mkdir()
+    (folder / "notes.tmp").touch()
+    (folder / "dataset.json.12.tmp").touch()
+    assert repair(folder) == ["removed dataset.json.12.tmp, left by a killed writer"]
+    code, _, err = call("collect-rollouts", options(folder, **{"ground-truth": True}))
+    assert code == 0, err
+    assert {"work.tmp", "work.12.tmp", "notes.tmp"} <= {path.name for path in folder.iterdir()}
 
 
 def test_repair_waits_for_the_collector(folder, tmp_path):
