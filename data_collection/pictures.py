@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 
 from data_collection.dataset import RGBDDataset
 from data_collection.files import written_aside
+from envs.errors import UsageError
 
 SHEET_FRAMES = 10
 TILE = 128  # pixels: least edge of a frame in a picture
@@ -31,7 +34,7 @@ def write_contact_sheet(dataset: RGBDDataset, episodes: Sequence[int], path: Pat
     lines = []
     for frames in (_frames(dataset, number) for number in episodes):
         chosen = np.linspace(0, len(frames) - 1, min(SHEET_FRAMES, len(frames))).round().astype(int)
-        tiles = [_padded(frames[i]) for i in chosen]
+        tiles = [_tile(frames[i]) for i in chosen]
         tiles += [np.full_like(tiles[0], 255)] * (SHEET_FRAMES - len(tiles))  # a short episode
         lines.append(np.concatenate(tiles, axis=1))
     with written_aside(path) as aside:
@@ -39,36 +42,71 @@ def write_contact_sheet(dataset: RGBDDataset, episodes: Sequence[int], path: Pat
 
 
 def write_film(dataset: RGBDDataset, episodes: Sequence[int], path: Path) -> None:
-    """An MP4 at the control rate of several episodes side by side; a short one waits on its last frame."""
+    """An MP4 at the control rate of several episodes beside and below each other; a short one waits on its last frame.
+
+    Raises:
+        UsageError: ffmpeg does not write it; a film that was there stays.
+    """
     films = [_frames(dataset, number) for number in episodes]
+    steps = max(len(frames) for frames in films)
+    pictures = (_grid([_tile(frames[min(step, len(frames) - 1)]) for frames in films]) for step in range(steps))
     with written_aside(path) as aside:
-        film: Any = None
-        for step in range(max(len(frames) for frames in films)):
-            tiles = [_padded(frames[min(step, len(frames) - 1)]) for frames in films]
-            picture = np.concatenate(tiles, axis=1)
+        size = _encode(pictures, float(dataset.attrs["control_rate"]), aside)
+        if not _is_film(aside, steps):
+            raise UsageError(f"ffmpeg does not write {path} ({size}); make room for it, or give fewer --clips")
+
+
+def _grid(tiles: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Tiles of one size in rows, of about a square in all; what is left of the last row is white."""
+    height, width = tiles[0].shape[:2]
+    columns = min(len(tiles), math.ceil(math.sqrt(len(tiles) * height / width)))
+    full = [*tiles, *[np.full_like(tiles[0], 255)] * (-len(tiles) % columns)]
+    rows = [np.concatenate(full[start : start + columns], axis=1) for start in range(0, len(full), columns)]
+    return np.concatenate(rows)
+
+
+def _encode(pictures: Iterable[NDArray[np.uint8]], rate: float, path: Path) -> str:
+    """Have ffmpeg write an MP4; whether it did, only the file tells. Returns the size of the pictures, in words."""
+    film: Any = None
+    size = "no pictures"
+    with contextlib.suppress(OSError):  # ffmpeg has ended
+        for picture in pictures:
             if film is None:
+                size = f"{picture.shape[1]} x {picture.shape[0]} pixels"
                 film = imageio_ffmpeg.write_frames(
-                    str(aside),
+                    str(path),
                     picture.shape[1::-1],
-                    fps=float(dataset.attrs["control_rate"]),
+                    fps=rate,
                     macro_block_size=2,
+                    ffmpeg_log_level="quiet",
                     output_params=["-f", "mp4"],  # the temporary name does not say so
                 )
                 film.send(None)
             film.send(np.ascontiguousarray(picture))
+    if film is not None:
         film.close()
+    return size
+
+
+def _is_film(path: Path, frames: int) -> bool:
+    """Whether a file holds so many pictures."""
+    try:
+        return imageio_ffmpeg.count_frames_and_secs(str(path))[0] == frames
+    except (OSError, RuntimeError):
+        return False
 
 
 def _frames(dataset: RGBDDataset, number: int) -> NDArray[np.uint8]:
-    """(T, 2 * h, w, 3): an episode's colour above its depth, enlarged to at least `TILE` by whole factors."""
+    """(T, 2 * h, w, 3): an episode's colour above its depth."""
     columns: dict[str, Any] = dataset.episode(number)
     low, high = np.percentile(columns["depth"], (0.5, 99.5))
-    frames = np.concatenate([columns["rgb"], colour_depth(columns["depth"], low, high)], axis=1)
-    factor = max(1, -(-TILE // columns["rgb"].shape[2]))
-    return frames.repeat(factor, axis=1).repeat(factor, axis=2)
+    return np.concatenate([columns["rgb"], colour_depth(columns["depth"], low, high)], axis=1)
 
 
-def _padded(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A tile with its share of the gap, its edges even numbers (video encoders want them)."""
-    odd_height, odd_width = frame.shape[0] % 2, frame.shape[1] % 2
-    return np.pad(frame, ((0, GAP + odd_height), (0, GAP + odd_width), (0, 0)), constant_values=255)
+def _tile(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A frame enlarged to at least `TILE` by a whole factor, with its share of the gap, its edges even numbers (video
+    encoders want them)."""
+    factor = max(1, -(-TILE // frame.shape[1]))
+    large = frame.repeat(factor, axis=0).repeat(factor, axis=1)
+    odd_height, odd_width = large.shape[0] % 2, large.shape[1] % 2
+    return np.pad(large, ((0, GAP + odd_height), (0, GAP + odd_width), (0, 0)), constant_values=255)

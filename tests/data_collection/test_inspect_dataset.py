@@ -1,10 +1,12 @@
 """Inspection says what is there; repair drops what is damaged and nothing else."""
 
+import functools
 import json
 import shutil
 
 import h5py
 import imageio.v2 as imageio
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from commands import assert_one_line_error, call, finish, options, start
@@ -14,6 +16,7 @@ from shards import ATTRS, flip_a_byte_of, make_episode
 from data_collection.dataset import RGBDDataset
 from data_collection.files import locked
 from data_collection.goal_statistics import goal_statistics
+from data_collection.pictures import write_film
 from data_collection.repair import find_damage, repair
 from data_collection.schema import episode_hash
 from data_collection.statistics import BY_NUMBER, column_ranges, moved_shares, workspace_coverage
@@ -44,6 +47,27 @@ def test_report_table_and_pictures(folder):
     film = imageio.mimread(folder / "inspection" / "episodes.mp4", memtest=False)
     assert len(film) == 9 and film[0].shape == (2 * 128 + 4, 3 * (128 + 4), 3)
     assert np.ptp(film[0]) > 100
+
+
+def test_many_episodes_are_filmed_in_rows(folder, tmp_path):
+    dataset, path = RGBDDataset(folder), tmp_path / "film.mp4"
+    write_film(dataset, [0, 1, 2, 3] * 35, path)  # side by side they would be wider than encoders take
+    film = imageio.mimread(path, memtest=False)
+    height, width = film[0].shape[:2]
+    assert len(film) == 9 and (height, width) == (9 * (2 * 128 + 4), 17 * (128 + 4))
+    tiles = film[0].reshape(9, height // 9, 17, width // 17, 3).swapaxes(1, 2).reshape(153, height // 9, width // 17, 3)
+    assert (np.ptp(tiles[:140], axis=(1, 2, 3)) > 100).all() and tiles[140:].min() > 240
+
+
+def test_a_film_that_ffmpeg_does_not_write_leaves_the_old_one(folder, monkeypatch):
+    path = folder / "inspection" / "episodes.mp4"
+    path.parent.mkdir()
+    path.write_bytes(b"the film of before")
+    write = functools.partial(imageio_ffmpeg.write_frames, codec="none-such")
+    monkeypatch.setattr(imageio_ffmpeg, "write_frames", write)
+    assert_one_line_error(call("inspect-dataset", [folder, "--clips", "2"]), "episodes.mp4", "pixels", "--clips")
+    assert path.read_bytes() == b"the film of before"
+    assert not list(path.parent.glob("*.tmp"))
 
 
 def test_ranges_are_of_whole_columns_and_only_short_rows_are_held_in_memory(collected, monkeypatch):
