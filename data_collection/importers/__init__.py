@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from data_collection.importers.source import Source, SourceOptions
+import dataclasses
+
+from data_collection.importers.source import SPLITS, Source, SourceOptions
 from envs.errors import UsageError
 
 FORMATS = ("calvin", "omnipush", "dexhand")
@@ -14,6 +16,9 @@ def open_source(name: str, options: SourceOptions) -> Source:
     Raises:
         UsageError: no such format, or the folder is not in it.
     """
+    # `.` and a link tell neither the name of the split nor what is beside it.
+    path = options.path.absolute() if options.path.name in SPLITS else options.path.resolve()
+    options = dataclasses.replace(options, path=path)
     if name == "calvin":
         from data_collection.importers.calvin import open_calvin
 

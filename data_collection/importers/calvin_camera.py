@@ -40,7 +40,7 @@ def read_recording(folder: Path, near: float, far: float) -> Recording:
         far: greatest depth of the dataset to be, metres.
 
     Raises:
-        UsageError: there is no config, or it does not tell the static camera.
+        UsageError: there is no config, or it does not tell the static camera; or the depth range is none.
     """
     places = [folder / CONFIG, *(folder.parent / name / CONFIG for name in SPLITS), folder.parent / CONFIG]
     path = next((place for place in places if place.is_file()), None)
@@ -53,6 +53,8 @@ def read_recording(folder: Path, near: float, far: float) -> Recording:
         static = config["cameras"]["static"]
         eye, target, up = (np.array(static[key], np.float64) for key in ("look_from", "look_at", "up_vector"))
         camera = _camera(static, eye, target, up, near, far)
+    except UsageError:  # about the depth range, of which the config says nothing
+        raise
     except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise UsageError(

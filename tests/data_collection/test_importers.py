@@ -2,6 +2,7 @@
 
 import json
 from contextlib import nullcontext
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from PIL import Image
 
 from data_collection.actions import aggregate_actions
 from data_collection.dataset import RGBDDataset
+from data_collection.importers import SourceOptions, open_source
 from data_collection.importers.images import average_colour, nearest_depth, resize_camera
 from envs.camera import CameraModel
 from envs.errors import UsageError
@@ -79,6 +81,12 @@ def test_calvin_scene_from_folder_config_or_option(tmp_path):
     assert imported("calvin", validation, tmp_path / "0", *size).attrs["env_id"] == "calvin/D"
     assert imported("calvin", other, tmp_path / "1", *size).attrs["env_id"] == "calvin/B"
     assert imported("calvin", other, tmp_path / "2", *size, "--scene", "C").attrs["env_id"] == "calvin/C"
+
+
+def test_a_depth_range_that_is_none_is_not_blamed_on_the_config(calvin, tmp_path):
+    arguments = ["--format", "calvin", calvin, tmp_path / "data", "--near", "7"]
+    code, _, err = call("import-dataset", arguments)
+    assert code == 2 and "near=7.0, far=6.3" in err and "merged_config" not in err
 
 
 def test_long_play_is_cut_without_losing_an_action(calvin, tmp_path):
@@ -151,6 +159,22 @@ def test_a_test_split_is_not_trained_on(tmp_path):
         options = parse_options(["--preset", "tiny", "--data", str(dataset.path), "--out", str(tmp_path / "run")])
         with pytest.raises(UsageError, match="for testing only") if refused else nullcontext():
             open_data(options)
+
+
+@pytest.mark.parametrize("path", [".", "../test", "object/..", "link"])
+def test_a_split_keeps_its_name_however_its_folder_is_named(tmp_path, monkeypatch, path):
+    root = write_omnipush(tmp_path / "omnipush", objects=("object",), pushes=1, split="test")
+    (root / "test" / "link").symlink_to(root / "test")
+    monkeypatch.chdir(root / "test")
+    source = open_source("omnipush", SourceOptions(Path(path), image_size=16))
+    assert source.split == "test"
+    assert not source.notes  # the intrinsics are beside the split
+    training = write_calvin(tmp_path / "task_ABC_D", [(0, 2)], "training")
+    (training / "object").mkdir()
+    (training / "link").symlink_to(training)
+    monkeypatch.chdir(training)
+    source = open_source("calvin", SourceOptions(Path(path.replace("test", "training")), image_size=16))
+    assert (source.split, source.env_id) == ("training", "calvin/ABC")
 
 
 def test_omnipush_without_intrinsics_takes_the_published_ones(tmp_path):
