@@ -58,7 +58,8 @@ def resolve_env(name: str, scene: str | None) -> tuple[str, dict[str, Any]]:
     if name not in KNOWN_ENVS and not ("/" in name or ":" in name):
         known_names = ", ".join(KNOWN_ENVS)
         raise UsageError(f"no environment named '{name}'; choose one of {known_names}, or give a Gymnasium id")
-    known = KNOWN_ENVS.get(name, KnownEnv(name))
+    ours = known_env(name)
+    known = KNOWN_ENVS.get(name) or KnownEnv(name, kwargs=ours.kwargs if ours else {})
     if scene is None:
         scene = known.scenes[0] if known.scenes else ""
     elif not known.scenes:

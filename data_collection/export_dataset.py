@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Annotated, Literal
 
 import tyro
@@ -57,5 +59,11 @@ def main(config: Config) -> None:
     print(f"{dataset.episodes} episodes in {written}")
 
 
+def _stop(signum: int, frame: FrameType | None) -> None:
+    print("terminated; nothing was written", file=sys.stderr)
+    sys.exit(128 + signum)
+
+
 def command() -> None:
+    signal.signal(signal.SIGTERM, _stop)
     run(Config, main)

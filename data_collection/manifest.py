@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from data_collection.files import write_json
+from data_collection.policies.stable_baselines import without_folder
 from data_collection.schema import SCHEMA_VERSION
 from envs.errors import UsageError
 
@@ -43,6 +44,8 @@ class Manifest:
             if field.name == "episodes":
                 continue
             asked, there = getattr(self, field.name), getattr(before, field.name)
+            if field.name == "policy" and without_folder(asked) == without_folder(there):
+                continue
             if asked != there:
                 raise UsageError(
                     f"{folder} was collected with {field.name} = {there!r}, not {asked!r}; "

@@ -33,7 +33,7 @@ class Config:
     """Train a goal-conditioned policy from the simulator's state, without pictures. Same command: goes on."""
 
     out: Path
-    """The policy, a .zip file; written every `save_every` steps and at the end. A .json beside it has the options."""
+    """The policy, a .zip file; written every `--save-every` steps and at the end. A .json beside it has the options."""
     env: str = "dexhand"
     """Environment with goals: a short name (dexhand), or a Gymnasium id."""
     algorithm: Literal["sac", "td3", "ddpg"] = "sac"
@@ -146,6 +146,10 @@ def _make_env(config: Config) -> gymnasium.Env:
         raise UsageError(f"cannot make environment '{env_id}': {error}; check --env") from error
     if not hasattr(env.unwrapped, "compute_reward"):
         raise UsageError(f"environment '{env_id}' has no goals (no compute_reward); choose one that has, as dexhand")
+    assert env.spec is not None
+    steps = env.spec.max_episode_steps or 0
+    if config.buffer < 2 * steps:  # relabelling needs a whole episode beside the one under way
+        raise UsageError(f"--buffer is {config.buffer}; give at least {2 * steps}, two episodes of '{env_id}'")
     return env
 
 

@@ -42,6 +42,11 @@ def policy_name(path: Path) -> str:
     return f"{path}#{_digest(path)}"
 
 
+def without_folder(name: str) -> str:
+    """A policy's name without the folder of its file: the same for the same file, wherever it is named from."""
+    return Path(name).name if "#" in name else name
+
+
 class StableBaselinesPolicy:
     """Acts as trained, without exploration.
 

@@ -1,5 +1,8 @@
 """Datasets in the formats of other projects, opened as those open them."""
 
+import signal
+import sys
+
 import h5py
 import numpy as np
 import pytest
@@ -74,6 +77,27 @@ def test_an_interrupted_export_leaves_nothing(folder, tmp_path, monkeypatch):
         ["stable-worldmodel", "--out", tmp_path / "d.h5"],
     ):
         assert call("export-dataset", [folder, "--to", *to])[0] == 130
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_terminated_export_leaves_nothing(folder, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("minari")
+    from data_collection import export_dataset
+    from data_collection.exporters import flat_file, minari_dataset
+
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    for module, name, to in (
+        (minari_dataset, "episode_buffer", ["minari", "--name", "calvin/d-v0", "--out", tmp_path]),
+        (flat_file, "_columns", ["stable-worldmodel", "--out", tmp_path / "d.h5"]),
+    ):
+        monkeypatch.setattr(module, name, lambda *_: signal.raise_signal(signal.SIGTERM))
+        monkeypatch.setattr(sys, "argv", ["export-dataset", str(folder), "--to", *map(str, to)])
+        try:
+            with pytest.raises(SystemExit) as stop:
+                export_dataset.command()
+        finally:
+            signal.signal(signal.SIGTERM, before)
+        assert stop.value.code == 143 and "terminated; nothing was written" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

@@ -227,6 +227,16 @@ def test_training_goes_on_where_it_stopped(trained, tmp_path):
         make_policy(policy_name(trained).replace(str(trained), str(path)))
 
 
+def test_collecting_goes_on_wherever_the_policy_is_named_from(trained, tmp_path, monkeypatch):
+    monkeypatch.chdir(trained.parent)
+    before = Config(tmp_path, env="dexhand", policy=trained.name).manifest()
+    Config(tmp_path, env="dexhand", policy=str(trained)).manifest().check_continues(before, tmp_path)
+    other = copy_of(trained, tmp_path)
+    other.write_bytes(other.read_bytes() + b"more")
+    with pytest.raises(UsageError, match=r"was collected with policy = 'hand\.zip#"):
+        Config(tmp_path, env="dexhand", policy=str(other)).manifest().check_continues(before, tmp_path)
+
+
 def test_a_policy_of_an_unknown_class_is_named(tmp_path):
     path = tmp_path / "own.zip"
     with zipfile.ZipFile(path, "w") as file:
@@ -262,6 +272,12 @@ def test_a_part_of_a_run_has_its_own_episodes_and_any_device(trained, tmp_path, 
     assert not np.array_equal(resumed.action_space.sample(), action)
     assert devices == ["auto"]
     hand.close()
+
+
+def test_a_buffer_that_holds_no_whole_episode_is_refused(tmp_path):
+    with pytest.raises(UsageError, match="--buffer is 150; give at least 200, two episodes"):
+        train_policy.main(train_policy.Config(tmp_path / "new.zip", steps=300, batch=8, buffer=150))
+    assert not list(tmp_path.iterdir())
 
 
 def test_training_with_other_options_is_refused(trained, tmp_path):
