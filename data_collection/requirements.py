@@ -41,6 +41,14 @@ def check_env(env: gymnasium.Env, env_id: str, ground_truth: bool) -> None:
     action = env.action_space
     if not isinstance(action, gymnasium.spaces.Box) or len(action.shape) != 1:
         raise UsageError(f"environment '{env_id}' takes actions {action}; it must take a Box of shape (A,)")
+    if not action.is_bounded():
+        raise UsageError(f"environment '{env_id}' takes actions {action}, without bounds; give it a Box that has them")
+    for name in ("ACTION_AGGREGATION", "ACTION_SCALE"):
+        if np.shape(getattr(inner, name)) != action.shape:
+            raise UsageError(
+                f"environment '{env_id}' has {name} {getattr(inner, name)!r}; it must have one for each of the "
+                f"{action.shape[0]} numbers of an action"
+            )
     if ground_truth and len(inner.body_names) > MAX_BODIES:
         raise UsageError(
             f"environment '{env_id}' has {len(inner.body_names)} bodies, and a dataset stores ids of {MAX_BODIES}; "

@@ -39,7 +39,8 @@ def collect_episode(
         the columns of the schema, (steps + 1, ...) each, and whether the episode ended in a terminal state.
 
     Raises:
-        UsageError: the environment gave colours or ids that a dataset does not store.
+        UsageError: the environment gave colours or ids that a dataset does not store, or its `info` has something in
+            some steps only.
     """
     env_seeds, policy_seeds = np.random.SeedSequence((seed, episode)).spawn(2)
     obs, info = env.reset(seed=int(env_seeds.generate_state(1)[0] >> 1))
@@ -62,6 +63,7 @@ def collect_episode(
         if "joint_delta" in info:
             rows["joint_delta"].append(info["joint_delta"])
         _record(rows, env, obs, info, ground_truth)
+        _check_infos(rows)
         if terminated or truncated:
             break
     rows["action"].append(np.zeros(space.shape))
@@ -71,6 +73,17 @@ def collect_episode(
     rows["depth"] = [quantise_depth(frame, camera.near, camera.far) for frame in rows["depth"]]
     columns = {name: _stored(name, np.stack(rows[name])) for name in COLUMNS if name in rows}
     return columns, bool(terminated)
+
+
+def _check_infos(rows: dict[str, list[Any]]) -> None:
+    """Check, after a step, that what `info` has now it has had from the start."""
+    frames = len(rows["rgb"])
+    for name, wanted, where in (
+        ("scene_obs", frames, "reset and every step"),
+        ("joint_delta", frames - 1, "every step"),
+    ):
+        if name in rows and len(rows[name]) != wanted:
+            raise UsageError(f"the environment's info has '{name}' now and then; give it in {where}, or never")
 
 
 def _stored(name: str, values: NDArray[Any]) -> NDArray[Any]:

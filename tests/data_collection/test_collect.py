@@ -203,6 +203,7 @@ def test_an_environments_own_keywords_are_part_of_what_episodes_are(tmp_path):
         ),
         ({"env": "dexhand"}, {"new_goals": True, "image_size": 64}),
         ({"env": "dexhand", "env_kwargs": '{"new_goals": false}'}, {"new_goals": False, "image_size": 64}),
+        ({"env": "envs:t3vip/DexHand-v0"}, {"new_goals": True, "image_size": 64}),
         ({"env": "my/Env-v0"}, {}),
         ({"env": "my/Env-v0", "image_size": 64, "env_kwargs": '{"scene": "D"}'}, {"image_size": 64, "scene": "D"}),
     ],
@@ -229,6 +230,8 @@ def test_keyword_arguments_that_environments_get(tmp_path, changed, kwargs):
         ({"workers": 0}, ("--workers", "0")),
         ({"image-size": 2}, ("--image-size", "2")),
         ({"env": "standin:standin/Nothing-v0"}, ("standin/Nothing-v0",)),
+        ({"env": "planar-push", "env-kwargs": '{"supersample": 1.5}'}, ("supersample is 1.5", "odd number")),
+        ({"env": "planar-push", "env-kwargs": '{"supersample": 6001}'}, ("96016 x 96016", "smaller image size")),
     ],
 )
 def test_bad_options_are_one_line(tmp_path, changed, words):

@@ -41,6 +41,9 @@ gymnasium.register(ID, entry_point=Odd)
         ({"observes": {"depth": BOX(1, 3, (16, 16, 1), np.float32)}}, r"'depth' as float32 \(16, 16, 1\).*\(16, 16\)"),
         ({"observes": {"proprio": BOX(-1, 1, (2, 3), np.float32)}}, r"'proprio' as float32 \(2, 3\).*a vector"),
         ({"acts": gymnasium.spaces.Discrete(4)}, r"takes actions Discrete\(4\)"),
+        ({"acts": BOX(-1, np.inf, (3,), np.float32)}, "takes actions Box.*without bounds"),
+        ({"acts": BOX(-1, 1, (2,), np.float32)}, "has ACTION_AGGREGATION .*one for each of the 2 numbers"),
+        ({"ACTION_SCALE": (1.0,)}, r"has ACTION_SCALE \(1.0,\); it must have one for each of the 3 numbers"),
         ({"camera": "static"}, "has a str as camera"),
         ({"body_names": ["part"] * 257}, "257 bodies.*256; leave out --ground-truth"),
     ],
@@ -70,6 +73,27 @@ class Crowd(StandIn):
 class Nowhere(StandIn):
     def segmentation(self):
         return np.full((16, 16), -1, np.int32)
+
+
+class Late(StandIn):
+    """Forgets something at first."""
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=seed)[0], {}
+
+
+class Fitful(StandIn):
+    """Measures its joints every other step."""
+
+    def step(self, action):
+        *rest, info = super().step(action)
+        return *rest, info | ({"joint_delta": np.zeros(2)} if self.steps % 2 else {})
+
+
+@pytest.mark.parametrize(("env", "name"), [(Late, "scene_obs"), (Fitful, "joint_delta")])
+def test_infos_that_have_something_now_and_then_are_refused(env, name):
+    with pytest.raises(UsageError, match=f"info has '{name}' now and then; give it in .*every step"):
+        collect_episode(env(), RandomPolicy(), 3, seed=0, episode=0)
 
 
 @pytest.mark.parametrize(
