@@ -274,5 +274,5 @@ class _reading:
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._file.close()
-        if isinstance(error, OSError | RuntimeError):
+        if isinstance(error, OSError | KeyError | RuntimeError):  # a KeyError: HDF5 does not find, or get to, a column
             raise unreadable(self._shard.path, error) from error

@@ -174,6 +174,14 @@ def test_damaged_chunk_is_named_when_read(folder):
             read()
 
 
+def test_a_column_that_is_gone_is_named_when_read(folder):
+    dataset = RGBDDataset(folder)
+    with h5py.File(folder / "shard-00001.h5", "a") as file:
+        del file["rgb"]
+    with pytest.raises(DamagedShard, match=r"shard-00001\.h5 is damaged"):
+        dataset.load("rgb")
+
+
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EMFILE, errno.EIO])
 def test_a_shard_that_the_system_does_not_let_be_read_is_not_damaged(folder, monkeypatch, number):
     dataset, path = RGBDDataset(folder), folder / "shard-00001.h5"
