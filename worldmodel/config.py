@@ -27,8 +27,9 @@ class ModelConfig:
     """Whether decoders see the frame at full resolution; the paper's do not."""
     masks: int = 10
     """K: T3VIP's masks, the first of them the background, which never moves; the rivals' kernels."""
-    kernel_size: int = 9
-    """Of CDNA, SNA and SV2P: width of the kernels in pixels, 5 in the originals."""
+    kernel_size: int = 15
+    """Of CDNA, SNA and SV2P: width of the kernels in pixels, 5 in the originals. They move a pixel by half of that at the
+    most; where things go farther from frame to frame, these models cannot follow."""
     latents: LatentKind = "step"
     """One latent a step, one a clip, or none; CDNA, SNA and T3VIP-D have none in any case."""
     inferred_from: Evidence = "changes"
@@ -55,7 +56,7 @@ class ModelConfig:
         if self.lstm_kernel < 1 or self.lstm_kernel % 2 == 0:
             raise UsageError(f"lstm-kernel is {self.lstm_kernel}; give an odd number such as 3 or 5")
         if self.kernel_size < 1 or self.kernel_size % 2 == 0:
-            raise UsageError(f"kernel-size is {self.kernel_size}; give an odd number such as 5 or 9")
+            raise UsageError(f"kernel-size is {self.kernel_size}; give an odd number such as 5 or 15")
         if self.masks < 2:
             raise UsageError(f"masks is {self.masks}; give at least 2 (a background and one that moves)")
         if not self.translation_unit > 0:

@@ -10,8 +10,8 @@ Followed in all of them, and why not:
   that its pictures come out too bright; here every source has one mask.
 - Kernels start near the identity instead of a random blur, and the action enters their head as it enters T3VIP's:
   both make motion emerge sooner, and no rival shall lose for want of them.
-- 5 x 5 kernels, as in the originals, move a pixel by 2 at the most. That is less than an arm moves over a frame gap of
-  3, so 9 x 9 is the default here; `kernel_size` 5 gives the originals'.
+- 5 x 5 kernels, as in the originals, move a pixel by 2 at the most. An arm moves by up to 7 over a frame gap of 3, so
+  15 x 15 is the default here; `kernel_size` 5 gives the originals'.
 - The originals feed the robot's state and predict it again; no model here sees proprioception.
 """
 

@@ -76,7 +76,7 @@ def test_kernels_and_masks_sum_to_one_and_every_kernel_counts(kind, clips, rival
     prediction, _ = model.predict(rgb, depth, actions, None, model.blank_memory(rgb))
     assert isinstance(prediction, KernelPrediction) and prediction.depth is None
     assert prediction.masks.shape[1] == model.config.masks + (2 if kind == "cdna" else 3)
-    assert prediction.kernels.shape[1:] == (model.config.masks, 9, 9)
+    assert prediction.kernels.shape[1:] == (model.config.masks, 15, 15)
     torch.testing.assert_close(prediction.masks.sum(1), torch.ones_like(rgb[:, 0]))
     torch.testing.assert_close(prediction.kernels.sum((-1, -2)), torch.ones(len(rgb), model.config.masks))
     assert prediction.kernels.min() > 0 and prediction.rgb.min() >= 0 and prediction.rgb.max() <= 1 + 1e-6
