@@ -28,7 +28,7 @@ class ModelConfig:
     masks: int = 10
     """K: T3VIP's masks, the first of them the background, which never moves; the rivals' kernels."""
     kernel_size: int = 15
-    """Of CDNA, SNA and SV2P: width of the kernels in pixels, 5 in the originals. They move a pixel by half of that at the
+    """Of CDNA, SNA and SV2P: width of the kernels in pixels, 5 in the originals. They move a pixel by half of that at
     most; where things go farther from frame to frame, these models cannot follow."""
     latents: LatentKind = "step"
     """One latent a step, one a clip, or none; CDNA, SNA and T3VIP-D have none in any case."""
