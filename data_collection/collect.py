@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 
 from tqdm import tqdm
 
@@ -28,7 +26,7 @@ from data_collection.ray_cluster import connect
 from data_collection.schema import SHARD_PATTERN, read_shard
 from data_collection.workers import Collected, WorkerLost, collect_episodes
 from data_collection.writer import shard_path
-from envs.command import run
+from envs.command import end_on_sigterm, run
 from envs.errors import UsageError
 
 IMAGE_SIZE = 64  # pixels
@@ -160,11 +158,6 @@ def _begin(manifest: Manifest, folder: Path) -> None:
         manifest.save(folder)
 
 
-def _stop(signum: int, frame: FrameType | None) -> None:
-    print("terminated; run the same command again to go on", file=sys.stderr)
-    sys.exit(128 + signum)
-
-
 def command() -> None:
-    signal.signal(signal.SIGTERM, _stop)
+    end_on_sigterm("run the same command again to go on")
     run(Config, main)

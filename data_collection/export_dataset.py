@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Literal
 
 import tyro
@@ -15,7 +13,7 @@ from tqdm import tqdm
 from data_collection.dataset import RGBDDataset
 from data_collection.exporters.flat_file import export_flat_file
 from data_collection.exporters.minari_dataset import export_minari
-from envs.command import run
+from envs.command import end_on_sigterm, run
 from envs.errors import UsageError
 
 
@@ -59,11 +57,6 @@ def main(config: Config) -> None:
     print(f"{dataset.episodes} episodes in {written}")
 
 
-def _stop(signum: int, frame: FrameType | None) -> None:
-    print("terminated; nothing was written", file=sys.stderr)
-    sys.exit(128 + signum)
-
-
 def command() -> None:
-    signal.signal(signal.SIGTERM, _stop)
+    end_on_sigterm("nothing was written")
     run(Config, main)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Any, Literal
 
 import tyro
@@ -17,7 +15,7 @@ from data_collection.files import locked, remove_leftovers
 from data_collection.importers import Source, SourceOptions, open_source
 from data_collection.importers.crew import import_parts
 from data_collection.importers.report import Report, check_continues, read_finished
-from envs.command import run
+from envs.command import end_on_sigterm, run
 from envs.errors import UsageError
 
 
@@ -152,11 +150,6 @@ def _content(config: Config, source: Source) -> dict[str, Any]:
     }
 
 
-def _stop(signum: int, frame: FrameType | None) -> None:
-    print("terminated; run the same command again to go on", file=sys.stderr)
-    sys.exit(128 + signum)
-
-
 def command() -> None:
-    signal.signal(signal.SIGTERM, _stop)
+    end_on_sigterm("run the same command again to go on")
     run(Config, main)

@@ -11,6 +11,7 @@ import select
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from types import FrameType
 from typing import TypeVar
 
 import tyro
@@ -21,6 +22,20 @@ Config = TypeVar("Config")
 
 WRONG_PLACE = (PermissionError, NotADirectoryError, IsADirectoryError, FileExistsError)
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+
+
+def end_on_sigterm(said: str) -> None:
+    """Have SIGTERM end this process as Ctrl-C does, so that what is under way is cleared up, with exit code 143.
+
+    Args:
+        said: on stderr, about what becomes of the work.
+    """
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        print(f"terminated; {said}", file=sys.stderr)
+        sys.exit(128 + number)
+
+    signal.signal(signal.SIGTERM, stop)
 
 
 def run(

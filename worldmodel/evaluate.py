@@ -160,7 +160,8 @@ def _subject(
         "data": dataset.content_hash,
         "frame_gap": gap,
         "vgg": networks is not None,
-        **{name: getattr(options, name) for name in ("clips", "predicted", "context", "batch", "device")},
+        "device": str(find_device(options.device)),
+        **{name: getattr(options, name) for name in ("clips", "predicted", "context", "batch")},
     }
     if model is not None:
         subject["model"] = content_hashes(model)

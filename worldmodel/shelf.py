@@ -10,16 +10,13 @@ from typing import Any
 
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from torch import Tensor
 
 from data_collection.files import written_aside
-
-Measurements = dict[str, Tensor]
-"""Of the clips of one batch, by name."""
+from worldmodel.scores import Statistics
 
 
 class Shelf:
-    """Measurements of one subject, a file a batch.
+    """Statistics of one subject, a file a batch.
 
     Args:
         folder: for all subjects of an evaluation; None keeps nothing.
@@ -32,7 +29,7 @@ class Shelf:
             digest = hashlib.sha256(json.dumps(subject, sort_keys=True).encode()).hexdigest()
             self._folder = folder / digest[:16]
 
-    def find(self, batch: int) -> Measurements | None:
+    def find(self, batch: int) -> Statistics | None:
         """What has been measured on a batch, if anything has."""
         if self._folder is None:
             return None
@@ -41,7 +38,7 @@ class Shelf:
         except (SafetensorError, OSError):  # not there, or damaged: it is to be measured
             return None
 
-    def put(self, batch: int, measured: Measurements) -> Measurements:
+    def put(self, batch: int, measured: Statistics) -> Statistics:
         """Keep what was measured on a batch; returns it."""
         if self._folder is not None:
             self._folder.mkdir(parents=True, exist_ok=True)
