@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import imageio.v2 as imageio
-import imageio_ffmpeg
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
 from data_collection.dataset import RGBDDataset
 from data_collection.files import written_aside
-from envs.errors import UsageError
+from data_collection.video import write_video
 
 SHEET_FRAMES = 10
 TILE = 128  # pixels: least edge of a frame in a picture
@@ -45,15 +43,12 @@ def write_film(dataset: RGBDDataset, episodes: Sequence[int], path: Path) -> Non
     """An MP4 at the control rate of several episodes beside and below each other; a short one waits on its last frame.
 
     Raises:
-        UsageError: ffmpeg does not write it; a film that was there stays.
+        UsageError: see `write_video`; fewer episodes make a smaller film.
     """
     films = [_frames(dataset, number) for number in episodes]
     steps = max(len(frames) for frames in films)
     pictures = (_grid([_tile(frames[min(step, len(frames) - 1)]) for frames in films]) for step in range(steps))
-    with written_aside(path) as aside:
-        size = _encode(pictures, float(dataset.attrs["control_rate"]), aside)
-        if not _is_film(aside, steps):
-            raise UsageError(f"ffmpeg does not write {path} ({size}); make room for it, or give fewer --clips")
+    write_video(path, pictures, float(dataset.attrs["control_rate"]))
 
 
 def _grid(tiles: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
@@ -63,37 +58,6 @@ def _grid(tiles: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     full = [*tiles, *[np.full_like(tiles[0], 255)] * (-len(tiles) % columns)]
     rows = [np.concatenate(full[start : start + columns], axis=1) for start in range(0, len(full), columns)]
     return np.concatenate(rows)
-
-
-def _encode(pictures: Iterable[NDArray[np.uint8]], rate: float, path: Path) -> str:
-    """Have ffmpeg write an MP4; whether it did, only the file tells. Returns the size of the pictures, in words."""
-    film: Any = None
-    size = "no pictures"
-    with contextlib.suppress(OSError):  # ffmpeg has ended
-        for picture in pictures:
-            if film is None:
-                size = f"{picture.shape[1]} x {picture.shape[0]} pixels"
-                film = imageio_ffmpeg.write_frames(
-                    str(path),
-                    picture.shape[1::-1],
-                    fps=rate,
-                    macro_block_size=2,
-                    ffmpeg_log_level="quiet",
-                    output_params=["-f", "mp4"],  # the temporary name does not say so
-                )
-                film.send(None)
-            film.send(np.ascontiguousarray(picture))
-    if film is not None:
-        film.close()
-    return size
-
-
-def _is_film(path: Path, frames: int) -> bool:
-    """Whether a file holds so many pictures."""
-    try:
-        return imageio_ffmpeg.count_frames_and_secs(str(path))[0] == frames
-    except (OSError, RuntimeError):
-        return False
 
 
 def _frames(dataset: RGBDDataset, number: int) -> NDArray[np.uint8]:

@@ -10,6 +10,7 @@ import contextlib
 import ctypes
 import importlib
 import os
+import threading
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
@@ -22,6 +23,7 @@ REMEDY = "install software OpenGL: apt-get install libegl1 libgl1-mesa-dri (EGL)
 _CHOOSES_ITSELF = ("", "enable", "enabled", "on", "true", "1")
 _SWITCHED_OFF = ("disable", "disabled", "off", "false", "0")
 _GL_RENDERER = 0x1F01
+_mujoco_gl_borrowed = threading.RLock()  # held by the thread that has set `MUJOCO_GL` to what the user did not
 
 
 def import_mujoco() -> None:
@@ -32,13 +34,25 @@ def import_mujoco() -> None:
     try:
         importlib.import_module("mujoco")
     except (RuntimeError, AttributeError, ImportError):
-        wish = os.environ.pop("MUJOCO_GL", None)
-        if wish is None:
+        if "MUJOCO_GL" not in os.environ:
             raise
-        try:
+        with mujoco_gl(None):
             importlib.import_module("mujoco")
+
+
+@contextlib.contextmanager
+def mujoco_gl(value: str | None) -> Iterator[None]:
+    """`MUJOCO_GL` as some library is to find it in the block (None: not set); no context is created meanwhile."""
+    with _mujoco_gl_borrowed:
+        wish = os.environ.pop("MUJOCO_GL", None)
+        if value is not None:
+            os.environ["MUJOCO_GL"] = value
+        try:
+            yield
         finally:
-            os.environ["MUJOCO_GL"] = wish
+            os.environ.pop("MUJOCO_GL", None)
+            if wish is not None:
+                os.environ["MUJOCO_GL"] = wish
 
 
 class OffscreenContext(ABC):
@@ -204,7 +218,8 @@ def create_context() -> OffscreenContext:
     Raises:
         UsageError: `MUJOCO_GL` is nonsense, or no OpenGL works; says what to install.
     """
-    wish = os.environ.get("MUJOCO_GL", "")
+    with _mujoco_gl_borrowed:
+        wish = os.environ.get("MUJOCO_GL", "")
     name = wish.lower().strip()
     if name in _SWITCHED_OFF:
         raise UsageError(f"rendering is switched off by MUJOCO_GL={wish!r}; unset it, or set it to egl or osmesa")

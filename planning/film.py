@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from data_collection.files import written_aside
+from data_collection.video import write_video
 from envs.camera import CameraModel
 from envs.rendering import StaticCamera
 from planning.episode import Record, mark_of
@@ -101,9 +102,8 @@ class Film:
     def save(self, path: Path) -> None:
         """Write `path`.mp4 and `path`.png (a strip of some frames)."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        with written_aside(path.with_suffix(".mp4")) as aside:
-            fps = int(self._studio.inner.control_rate) / self._studio.steps_per_frame
-            iio.imwrite(aside, np.stack(self.frames), extension=".mp4", fps=fps, output_params=["-f", "mp4"])
+        fps = int(self._studio.inner.control_rate) / self._studio.steps_per_frame
+        write_video(path.with_suffix(".mp4"), self.frames, fps)
         chosen = np.unique(np.linspace(0, len(self.frames) - 1, STRIP_FRAMES).round().astype(int))
         rows = [np.concatenate(np.split(self.frames[i], len(VIEWS), axis=1), axis=0) for i in chosen]
         with written_aside(path.with_suffix(".png")) as aside:

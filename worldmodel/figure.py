@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import imageio.v3 as imageio
 import numpy as np
@@ -13,6 +12,7 @@ from PIL import Image as Pillow
 from PIL import ImageDraw
 
 from data_collection.files import written_aside
+from data_collection.video import write_video
 from worldmodel.colours import Image
 from worldmodel.legends import DARK, GREY, Scales, font, legend
 
@@ -176,10 +176,8 @@ def write_film(board: Storyboard, path: Path, scale: int, speed: float) -> None:
     pictures = list(film(board, scale))
     hold = [round(HOLD_S * rate) if frame in (0, len(pictures) - 1) else 0 for frame in range(len(pictures))]
     times = [repeats * (1 + extra) for extra in hold]
-    frames = np.repeat(np.stack(pictures), times, axis=0)
-    options: dict[str, Any] = {"macro_block_size": 2, "quality": 8, "output_params": ["-f", "mp4"]}
-    with written_aside(path) as aside:
-        imageio.imwrite(aside, frames, extension=".mp4", fps=rate * repeats, **options)
+    shown = (picture for picture, count in zip(pictures, times, strict=True) for _ in range(count))
+    write_video(path, shown, rate * repeats, quality=8)
 
 
 def _spread(first: int, stop: int, count: int) -> list[int]:

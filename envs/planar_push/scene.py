@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from envs import viewpoints
+from envs.gl import mujoco_gl
 from envs.planar_push.wardrobe import CONTACTS, VISIBLE, add_object
 
 CONTROL_RATE, SUBSTEPS = 12, 20  # Hz, physics steps in a control step; a push of Omnipush has 12 frames and takes 1 s
@@ -39,15 +39,8 @@ def build_model() -> mujoco.MjModel:
 
 def _import_mjcf() -> Any:
     """dm_control's `mjcf`, without OpenGL: its import would bind PyOpenGL to a platform for the life of the process."""
-    wish = os.environ.get("MUJOCO_GL")
-    os.environ["MUJOCO_GL"] = "disable"
-    try:
+    with mujoco_gl("disable"):
         from dm_control import mjcf
-    finally:
-        if wish is None:
-            del os.environ["MUJOCO_GL"]
-        else:
-            os.environ["MUJOCO_GL"] = wish
     return mjcf
 
 

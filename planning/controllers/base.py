@@ -62,6 +62,13 @@ class HoldingController:
         self._steps = 0
 
     def act(self, observation: Observation) -> NDArray[np.float32]:
+        """See `Controller`.
+
+        Raises:
+            UsageError: there was no `reset`.
+        """
+        if not hasattr(self, "goal"):
+            raise UsageError("act() before reset(): a controller does not know its goal yet; call reset first")
         start = time.perf_counter()
         self.follower.observe(observation)
         if self._steps % self.hold == 0:

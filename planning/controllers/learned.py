@@ -33,7 +33,7 @@ class LearnedController(PlanningController):
         options: effector, follower, reach; see `PlanningController`.
 
     Raises:
-        UsageError: the model is of another kind, or was trained with another camera.
+        UsageError: the model is of another kind, or was trained with another camera, or is to be shown no frame.
 
     Attributes:
         kinds: of models that it can plan with; all, unless a subclass says otherwise.
@@ -51,6 +51,8 @@ class LearnedController(PlanningController):
         context_frames: int = 2,
         **options: Any,
     ) -> None:
+        if context_frames < 1:
+            raise UsageError(f"context_frames is {context_frames}; show the model 1 frame or more")
         if model.kind not in self.kinds:
             raise UsageError(
                 f"the model is a {model.kind}, but {type(self).__name__} plans with {' or '.join(self.kinds)};"

@@ -65,7 +65,7 @@ def test_a_film_that_ffmpeg_does_not_write_leaves_the_old_one(folder, monkeypatc
     path.write_bytes(b"the film of before")
     write = functools.partial(imageio_ffmpeg.write_frames, codec="none-such")
     monkeypatch.setattr(imageio_ffmpeg, "write_frames", write)
-    assert_one_line_error(call("inspect-dataset", [folder, "--clips", "2"]), "episodes.mp4", "pixels", "--clips")
+    assert_one_line_error(call("inspect-dataset", [folder, "--clips", "2"]), "episodes.mp4", "pixels", "a smaller film")
     assert path.read_bytes() == b"the film of before"
     assert not list(path.parent.glob("*.tmp"))
 

@@ -68,3 +68,20 @@ print(os.environ["MUJOCO_GL"], mujoco.MjModel.from_xml_string("<mujoco/>").nbody
         [sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=60
     )
     assert result.stdout.split() == [value, "1"], result.stderr
+
+
+def test_environments_made_in_several_threads_at_once_leave_mujoco_gl_alone():
+    program = """
+import os
+from concurrent.futures import ThreadPoolExecutor
+import gymnasium as gym
+import envs
+def brightness(_):
+    with gym.make("t3vip/PlanarPush-v0") as env:
+        return int(env.reset(seed=3)[0]["rgb"].sum())
+before = os.environ.get("MUJOCO_GL")
+with ThreadPoolExecutor(4) as threads:
+    print(len(set(threads.map(brightness, range(4)))), os.environ.get("MUJOCO_GL") == before)
+"""
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert result.stdout.split() == ["1", "True"], result.stderr

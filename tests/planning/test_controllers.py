@@ -138,6 +138,17 @@ def test_a_camera_may_stand_elsewhere(exact_model, camera):
     T3VIPController(exact_model, replace(camera, world_T_camera=np.eye(4)), planner())
 
 
+@pytest.mark.parametrize("frames", [0, -1])
+def test_a_model_is_shown_a_frame_at_least(exact_model, camera, frames):
+    with pytest.raises(UsageError, match=f"context_frames is {frames}; show the model 1 frame or more"):
+        T3VIPController(exact_model, camera, planner(), context_frames=frames)
+
+
+def test_an_episode_begins_with_reset(world):
+    with pytest.raises(UsageError, match=r"act\(\) before reset\(\).*call reset first"):
+        ProportionalController(3).act(world.observation())
+
+
 def test_holding_is_an_interface():
     with pytest.raises(NotImplementedError):
         HoldingController(3).decide({})
