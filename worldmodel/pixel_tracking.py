@@ -4,6 +4,10 @@ A distribution over the pixels of the current frame goes the way of the colours 
 foresight"): through the same kernels, blended by the same masks. What the mask takes from the current frame stays;
 what it takes from the first frame is where the designated pixels were then; what it takes from the generated picture
 came from nowhere, so that this mass is lost. The rest is scaled up to sum 1.
+
+Among the pixels near a hand some show the table behind it, and the masks are soft: the mean of the distribution would lag
+behind the hand. So the track also adds up how far the kernels take what they move, as `HandTrack` sets the background
+apart for a model of rigid motions.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ from worldmodel.geometry import pixel_grid
 from worldmodel.kernels import KernelPrediction
 
 GRID = 8  # pixels
+LEAST_MOVED = 0.02  # below this share of mass that kernels move, it counts as still
 Box = tuple[int, int, int, int]
 """Rows top to bottom and columns left to right of a window, the ends not included."""
 
@@ -37,11 +42,14 @@ class PixelTrack:
     Attributes:
         distribution: (N, H, W), sums to 1 in each future. N is 1 at the start, from which any number of futures begin.
             A future in which all mass was lost is NaN from then on.
+        shift: (N, 2), how far (u, v) the kernels have taken the mass that they moved, pixels; the mean at each step, added
+            up over the steps.
         first: (1, H, W), the designated pixels of the first frame that the model was shown.
         box: the window outside of which there is no mass, in no future.
     """
 
     distribution: Tensor
+    shift: Tensor
     first: Tensor
     box: Box
 
@@ -56,7 +64,7 @@ class PixelTrack:
         first = now if first is None else first
         rows, columns = (now + first).nonzero().unbind(1)
         box = int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1
-        return cls(now[None], first[None], _rounded(box, *now.shape))
+        return cls(now[None], now.new_zeros((1, 2)), first[None], _rounded(box, *now.shape))
 
     def advance(self, prediction: KernelPrediction) -> PixelTrack:
         """One predicted step on.
@@ -75,14 +83,20 @@ class PixelTrack:
         box = _rounded((top - reach, bottom + reach, left - reach, right + reach), height, width)
         seen = (..., slice(box[0], box[1]), slice(box[2], box[3]))
         masks, now, first = masks[seen], self.distribution[:, None][seen], self.first[seen]
-        padded = F.pad(now, (reach,) * 4).expand(futures, -1, -1, -1)
-        moved = convolve_padded(padded, kernels)[:, :, 0]  # (N, K, h, w)
-        mass = masks[:, 0] * now[:, 0] + (masks[:, 1 : 1 + count] * moved).sum(dim=1)
+        grid = pixel_grid(height, width).to(now)[seen]
+        sources = torch.cat((now, now * grid), dim=1)  # (N or 1, 3, h, w): mass, and where it is
+        padded = F.pad(sources, (reach,) * 4).expand(futures, -1, -1, -1)
+        moved = torch.einsum("nkhw,nkchw->nchw", masks[:, 1 : 1 + count], convolve_padded(padded, kernels))
+        mass = masks[:, 0] * now[:, 0] + moved[:, 0]
         if masks.shape[1] > count + 2:  # current frame, kernels, generated picture, first frame
             mass = mass + masks[:, count + 2] * first
+        total = mass.sum(dim=(1, 2), keepdim=True)
         distribution = mass.new_zeros((futures, height, width))
-        distribution[seen] = mass / mass.sum(dim=(1, 2), keepdim=True)
-        return PixelTrack(distribution, self.first, box)
+        distribution[seen] = mass / total
+        share, *origin = (moved.sum(dim=(2, 3)) / total[:, 0]).unbind(1)
+        way = torch.einsum("nhw,chw->nc", moved[:, 0] / total, grid) - torch.stack(origin, dim=1)
+        shift = self.shift + way / share.clamp(min=LEAST_MOVED)[:, None]
+        return PixelTrack(distribution, shift, self.first, box)
 
     def expected_position(self) -> Tensor:
         """(N, 2), the mean pixel (u, v)."""

@@ -44,10 +44,8 @@ class PixelController(LearnedController):
     def imagine(self, observation: Observation) -> CostFunction:
         state = self.observed()
         start = PixelTrack.start(self.distribution(self.designated[-1]), self.distribution(self.designated[0]))
-        # The point need be none of the pixels (the TCP is not): it keeps a constant offset from their mean.
-        offset = self.pixel(self.follower.point) - start.expected_position()[0]
-        goal = self.tensor(self.goal.pixel)
-        target = goal - offset
+        point, goal = self.pixel(self.follower.point), self.tensor(self.goal.pixel)
+        offset = point - start.expected_position()[0]  # of a point that is none of the pixels
         per_metre = float(self.camera.K[0, 0] / self.camera.to_camera(self.follower.point)[2])  # pixels
 
         @torch.inference_mode()
@@ -60,14 +58,14 @@ class PixelController(LearnedController):
                 last = step + 1 == actions.shape[1]  # nobody looks at its picture
                 future, prediction = self.model.step(future, actions[:, step], paint=False, picture=not last)
                 track = track.advance(prediction)
-                place = track.expected_position() + offset
                 if self.reach:
-                    distance = track.expected_distance(target)
+                    distance = track.expected_distance(goal - offset)
+                    place = track.expected_position() + offset
                     distance = distance + self.reach.cost(effector[:, step], place, goal, per_metre)
                 else:
-                    # The hand's pixels lie lopsidedly about their mean: their expected distance is least where their
-                    # median is in its place, nearly a pixel from where the TCP is at its goal.
-                    distance = (place - goal).norm(dim=1)
+                    # The hand goes as far as what the kernels move of its pixels, some of which show the table. (Their
+                    # expected distance would be least beside the goal, too: they lie lopsidedly about their mean.)
+                    distance = (point + track.shift - goal).norm(dim=1)
                 distances.append(distance)
             return discounted_distance(torch.stack(distances, dim=1).cpu().numpy())
 

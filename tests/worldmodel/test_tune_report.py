@@ -138,16 +138,20 @@ def test_a_search_around_the_preset_says_so(out):
 def test_the_motion_that_no_score_sees_is_told(out):
     assert "flow" not in markdown_of(out)  # nobody has measured it
     results = out / journal.JOURNAL
-    for number, flow in ((0, 0.2), (2, 0.3)):
+    for number, flow, tcp in ((0, 0.2, 0.1), (2, 0.3, 0.1)):
         line = {"kind": "score", "trial": number, "step": 27, "score": SCORES[number][2], "psnr": 20.0 + number}
-        journal.append(results, line | {"flow_error_moving": flow})
+        journal.append(results, line | {"flow_error_moving": flow, "tracking_error": tcp})
     text = markdown_of(out)
-    assert "Its scene-flow error on what moves is 0.30 (trial 0: 0.20), which no score counts: plan with it" in text
-    assert "| trial | status | at 3 | at 9 | at 27 | RGB, dB | flow error | learning rate |" in text
+    told = "Which no score counts: scene-flow error on what moves 0.30 (trial 0: 0.20); TCP off, as a share of its way"
+    assert f"{told} 0.10 (trial 0: 0.10): plan with it before you believe it.\n" in text
+    assert "| trial | status | at 3 | at 9 | at 27 | RGB, dB | flow error | TCP off | learning rate |" in text
     (row,) = (line for line in text.splitlines() if line.startswith("| 2* |"))
-    assert "| 40.00 | 22.00 | 0.30 |" in row
-    journal.append(results, {"kind": "score", "trial": 2, "step": 27, "score": 40.0, "flow_error_moving": 0.21})
-    assert "(trial 0: 0.20), which no score counts.\n" in markdown_of(out)
+    assert "| 40.00 | 22.00 | 0.30 | 0.10 |" in row
+    line = {"kind": "score", "trial": 2, "step": 27, "score": 40.0, "flow_error_moving": 0.21}
+    journal.append(results, line)  # of data without an arm
+    assert "scene-flow error on what moves 0.21 (trial 0: 0.20).\n" in markdown_of(out)
+    journal.append(results, line | {"tracking_error": 0.13})
+    assert "its way 0.13 (trial 0: 0.10): plan with it" in markdown_of(out)
 
 
 @pytest.mark.parametrize(

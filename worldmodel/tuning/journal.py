@@ -19,7 +19,7 @@ Status = Literal["running", "finished", "stopped", "diverged", "failed"]
 ENDED: tuple[Status, ...] = ("finished", "stopped", "diverged")
 """Of trials that no search takes any further; one that `failed` is tried again."""
 JOURNAL = "results.jsonl"
-PARTS = ("psnr", "depth_psnr", "flow_error_moving")
+PARTS = ("psnr", "depth_psnr", "flow_error_moving", "tracking_error")
 """Told with a score: the two that it is the sum of, dB, and with ground truth the motion that it does not see."""
 
 

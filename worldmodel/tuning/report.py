@@ -18,9 +18,10 @@ from worldmodel.tuning.space import as_options
 FILES = ("report.json", "report.md", "trials.png", "rank-correlation.png", "best.json")
 
 Document = dict[str, Any]
-_HEADINGS = dict(zip(PARTS, ("RGB, dB", "depth, dB", "flow error"), strict=True))
+_HEADINGS = dict(zip(PARTS, ("RGB, dB", "depth, dB", "flow error", "TCP off"), strict=True))
 WORSE = 1.2
-"""A flow error so many times that of the preset is pointed out."""
+"""Motion that is so many times as wrong as the preset's is pointed out."""
+_MOTION = {"flow_error_moving": "scene-flow error on what moves", "tracking_error": "TCP off, as a share of its way"}
 
 
 def write_report(out: Path) -> Document:
@@ -149,7 +150,7 @@ def markdown(document: Document) -> str:
     )
     lines += ["", "Scores in dB, after so many steps. * runs to the end whatever its scores."]
     if parts:
-        lines[-1] += " RGB, depth and flow are those of a trial's last score."
+        lines[-1] += " RGB, depth, flow and TCP are those of a trial's last score."
     for of, which in (("all", "all trials"), ("unpruned", "the unpruned trials")):
         pairs = document["rank_correlation"][of]
         if any(pair["r"] is not None for pair in pairs):
@@ -163,11 +164,13 @@ def markdown(document: Document) -> str:
 
 def _motion(best: Document, default: Document, budget: str) -> list[str]:
     """What the score does not see: a model may gain in PSNR and lose the motion that a planner goes by."""
-    ours, theirs = (trial["parts"].get(budget, {}).get("flow_error_moving") for trial in (best, default))
-    if ours is None or theirs is None:
+    ours, theirs = (trial["parts"].get(budget, {}) for trial in (best, default))
+    known = [name for name in _MOTION if name in ours and name in theirs]
+    if not known:
         return []
-    line = f"Its scene-flow error on what moves is {ours:.2f} (trial 0: {theirs:.2f}), which no score counts"
-    return [f"{line}{': plan with it before you believe it' if ours > WORSE * theirs else ''}.", ""]
+    told = "; ".join(f"{_MOTION[name]} {ours[name]:.2f} (trial 0: {theirs[name]:.2f})" for name in known)
+    worse = any(ours[name] > WORSE * theirs[name] for name in known)
+    return [f"Which no score counts: {told}{': plan with it before you believe it' if worse else ''}.", ""]
 
 
 def _last(trial: Document) -> dict[str, float]:
