@@ -68,7 +68,7 @@ def test_world_and_camera_frames_are_inverse(seed):
 
 
 def test_points_behind_the_camera_project_to_nan():
-    assert np.isnan(make_camera().project([[0.1, 0.1, -1.0], [0.0, 0.0, 0.0]])).all()
+    assert np.isnan(make_camera().project([[0.1, 0.1, -1.0], [0.0, 0.0, 0.0], [0.1, -0.1, 0.0]])).all()
 
 
 def test_json_is_exact():
@@ -97,10 +97,12 @@ def test_matrices_are_read_only_copies():
         ({"far": 0.2}, "far=0.2"),
         ({"far": float("nan")}, "far=nan"),
         ({"K": np.zeros((3, 3))}, "positive fx"),
+        ({"K": np.array([[9.0, 0.5, 3.5], [0, 9, 3.5], [0, 0, 1]])}, r"\[\[fx, 0, cx\]"),
         ({"K": np.eye(4)}, r"shape \(4, 4\)"),
         ({"K": "abc"}, "'abc'"),
         ({"world_T_camera": 2 * np.eye(4)}, "rigid transform"),
         ({"world_T_camera": np.diag([1.0, 1.0, -1.0, 1.0])}, "rigid transform"),
+        ({"world_T_camera": np.eye(4) + np.eye(4)[[3]].T @ np.eye(4)[[0]]}, "rigid transform"),
         ({"world_T_camera": np.full((4, 4), np.nan)}, "finite"),
     ],
 )

@@ -51,6 +51,22 @@ def test_first_samples_spread_as_asked():
     np.testing.assert_allclose(cost.batches[0].std(axis=0), 0.1 * kept_mean, rtol=0.06)
 
 
+def test_a_small_population_has_at_most_half_of_it_for_elites():
+    assert ICEMConfig(population=8).populations() == [8, 8, 8]
+    planner, cost = make(population=8), Recorder()
+    planner.plan(cost)
+    assert len(planner._elites) == 4
+
+
+def test_the_search_starts_in_the_middle_of_bounds_that_are_not_symmetric():
+    low, high = np.array([0.0, -4.0]), np.array([2.0, 8.0])
+    config = ICEMConfig(horizon=5, population=4000, iterations=1, noise_beta=0.0, init_std=0.1)
+    planner, cost = ICEM(config, low, high, np.random.default_rng(0)), Recorder()
+    planner.plan(cost)
+    np.testing.assert_allclose(cost.batches[0].mean(axis=(0, 1)), [1.0, 2.0], atol=0.05)
+    np.testing.assert_allclose(cost.batches[0].std(axis=(0, 1)) / np.sqrt(5 / 4), [0.1, 0.6], rtol=0.06)
+
+
 def test_at_the_default_horizon_samples_spread_twice_as_far():
     """As documented: the noise keeps its mean, and in a series of two there is as much of that as of the rest."""
     planner, cost = make(population=4000, iterations=1, init_std=0.1), Recorder()
@@ -119,6 +135,23 @@ def test_the_next_plan_starts_from_shifted_elites_and_mean_with_fresh_deviation(
     np.testing.assert_array_equal(shifted[:, :-1], elites[:3, 1:])
     planner.reset()
     assert (planner.mean == 0).all() and planner._elites is None
+
+
+def test_what_is_kept_and_what_is_shifted_are_two_shares():
+    for share, sizes in (({"keep_fraction": 0.0}, [43, 32, 25]), ({"shift_fraction": 0.5}, [45, 32, 25])):
+        planner, cost = make(**share), Recorder()
+        for _ in range(2):
+            planner.plan(cost)
+        assert [len(batch) for batch in cost.batches[3:]] == sizes
+    planner, calls = make(iterations=2, keep_fraction=0.0), []
+    plan = planner.plan(lambda actions: np.full(len(actions), float(len(calls.append(0) or calls))))
+    assert plan.cost == 2  # of the last iteration, though the one before it was better
+
+
+def test_where_few_costs_are_finite_there_are_fewer_elites():
+    planner, cost = make(), Recorder()
+    planner.plan(lambda actions: np.where(np.arange(len(actions)) < 3, cost(actions), np.nan))
+    assert len(planner._elites) == 3
 
 
 def test_the_executed_action_is_of_the_best_sequence_of_the_last_pool():

@@ -41,6 +41,14 @@ def test_a_folder_with_episodes_takes_only_its_own(tmp_path):
     assert config_of(tmp_path) == settings(10, t3vip="a", sv2p="c")
 
 
+def test_a_line_that_was_not_finished_is_cut_off_and_the_next_episode_comes_after_the_last_whole_one(tmp_path):
+    EpisodeLog(tmp_path, settings()).append(record("random", 0))
+    with (tmp_path / "episodes.jsonl").open("a") as lines:
+        lines.write('{"model": "rand')
+    EpisodeLog(tmp_path, settings()).append(record("random", 1))
+    assert list(EpisodeLog(tmp_path, settings()).records) == [("random", 0, 0), ("random", 1, 0)]
+
+
 class Reel:
     """A film without pictures."""
 

@@ -188,6 +188,17 @@ def test_what_follows_absolute_commands_with_a_lag(tmp_path, write_dataset):
         np.testing.assert_allclose(told[clip], np.diff(places[start : start + 10 : GAP], axis=0), atol=1e-6)
 
 
+def test_other_actions_are_of_the_same_episodes_and_joints_are_followed_if_they_are_known(tmp_path, write_dataset):
+    folder = write_dataset(tmp_path, [12, 12, 12], action_aggregation=["last"] * 7)
+    for shard in folder.glob("*.h5"):
+        with h5py.File(shard, "r+") as file:
+            file["joint_delta"] = np.zeros((len(file["action"]), 5), np.float32)
+    dataset = RGBDDataset(folder)
+    assert usual_column(dataset) == "action_followed"
+    held_out = ClipSource(dataset, GAP, slice(2, None))
+    assert held_out.with_actions("action_followed").starts(3).tolist() == held_out.starts(3).tolist()
+
+
 def test_colour_jitter_changes_colours_only_and_whole_clips_alike(source, starts):
     clips = source.at(starts[:4], 2)
     still = torch.stack((clips.rgb[:, 0],) * 2, dim=1)

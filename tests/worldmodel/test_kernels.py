@@ -89,6 +89,14 @@ def test_kernels_and_masks_sum_to_one_and_every_kernel_counts(kind, clips, rival
 
 @pytest.mark.parametrize("kind", RIVALS)
 @torch.no_grad()
+def test_an_untrained_kernel_takes_most_from_the_pixel_itself(kind, clips, rival):
+    model, rgb = rival(kind), clips.rgb[:, 0]
+    prediction, _ = model.predict(rgb, clips.depth[:, 0], clips.actions[:, 0], None, model.blank_memory(rgb))
+    assert prediction.kernels[..., 7, 7].mean() > 4 * prediction.kernels.mean()
+
+
+@pytest.mark.parametrize("kind", RIVALS)
+@torch.no_grad()
 def test_only_sna_and_sv2p_copy_from_the_first_frame(kind, clips, rival):
     model = rival(kind)
     depth, actions = clips.depth[:, 0], clips.actions[:, 0]

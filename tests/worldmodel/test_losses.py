@@ -1,5 +1,7 @@
 """Each term of the objective against its definition."""
 
+import math
+
 import pytest
 import torch
 
@@ -121,9 +123,18 @@ def test_smoothness_is_zero_for_linear_flow_and_lets_go_at_edges():
     assert losses.edge_aware_smoothness(rows, flat) == pytest.approx(2 / 6)
 
 
+def test_smoothness_is_the_mean_over_channels_of_flow_and_of_edges():
+    columns = pixel_grid(8, 10)[None, :1]
+    step, flat = (columns >= 5).float(), torch.full((1, 3, 8, 10), 0.5)
+    on_flat = float(losses.edge_aware_smoothness(step, flat))
+    assert losses.edge_aware_smoothness(step.expand(-1, 3, -1, -1), flat) == pytest.approx(on_flat)
+    faint = flat + 0.3 * step * torch.tensor([1.0, 0.0, 0.0]).view(3, 1, 1)  # in one colour of three
+    assert losses.edge_aware_smoothness(step, faint) == pytest.approx(on_flat * math.exp(-0.1 * losses.EDGE_SHARPNESS))
+
+
 def test_kl_is_that_of_torch_distributions():
     generator = torch.Generator().manual_seed(4)
-    mean, log_variance = (torch.randn((3, 2, 1, 4, 5), generator=generator) for _ in range(2))
+    mean, log_variance = (torch.randn((3, 2, 2, 4, 5), generator=generator) for _ in range(2))
     posterior = torch.distributions.Normal(mean, (0.5 * log_variance).exp())
     prior = torch.distributions.Normal(torch.zeros(()), torch.ones(()))
     expected = torch.distributions.kl_divergence(posterior, prior).flatten(2).sum(2).mean() / 640
@@ -134,6 +145,12 @@ def test_kl_is_that_of_torch_distributions():
 def test_negative_weights_are_refused(name):
     with pytest.raises(UsageError, match=rf"{name} is -0.5; give 0"):
         losses.LossWeights(**{name: -0.5})
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_no_numbers_are_refused(value):
+    with pytest.raises(UsageError, match=rf"kl is {value}; give 0"):
+        losses.LossWeights(kl=value)
 
 
 def test_a_window_of_nothing_is_refused():

@@ -52,7 +52,17 @@ def test_intervals_come_from_resampling_episodes():
     standard_error = clips[::20].std() / 50**0.5  # twenty equal clips of an episode say no more than one
     assert low < mean < high and high - low == pytest.approx(2 * 1.96 * standard_error, rel=0.15)
     assert interval([0.5, 0.5, 0.5], [0, 1, 2]) == (0.5, [0.5, 0.5])
+    assert interval([0.5, 0.5, 0.5], [0, 0, 1]) == (0.5, [0.5, 0.5])  # a resample may hold more clips, or fewer
     assert interval([0.1, 0.9], [4, 4]) == (0.5, None)
+
+
+def test_resamples_in_which_a_score_is_not_defined_do_not_count():
+    moving = torch.tensor([[0.0], [4.0]], dtype=torch.float64)  # nothing moves in one of two episodes
+    statistics = {"moving": moving, "moving_error": 0.5 * moving, "moving_length": moving, "moving_error_px": moving}
+    assert score_clips(statistics, np.array([0, 1]))["intervals"]["flow3d_epe_moving"] == [0.5, 0.5]
+    nothing = {name: torch.zeros_like(moving) for name in statistics}
+    scores = score_clips(nothing, np.array([0, 1]))
+    assert scores["flow3d_epe_moving"] is None and scores["intervals"]["flow3d_epe_moving"] is None
 
 
 def test_differences_are_resampled_together():

@@ -50,6 +50,26 @@ def test_errors_count_on_moving_pixels_in_metres_and_in_pixels(known):
     assert "flow3d_epe_moving" not in result["curves"]
 
 
+def test_the_hand_counts_where_it_moves_and_a_frame_at_rest_says_nothing_of_parts(known):
+    _, truth, motion = known
+    everywhere = torch.ones_like(truth.hand[:, CONTEXT - 1 :])
+    none = scores(no_motion(motion), motion, everywhere)
+    assert none["flow3d_epe_hand"] == pytest.approx(none["flow3d_epe_moving"])
+    hand = everywhere.clone()
+    hand[..., :12] = False  # half of the picture
+    assert scores(no_motion(motion), motion, hand)["flow3d_epe_hand_relative"] == pytest.approx(1)
+    rested = Motion(motion.scene_flow, motion.optical_flow, motion.disocclusion, motion.parts.clone())
+    rested.parts[:, 1] = 0
+    rested.parts[:, 1, 0, :15] = 1  # too few to tell
+    statistics = motion_statistics(no_motion(motion), rested, everywhere)
+    assert (statistics["frames_in_motion"] == 1).all()
+    assert scores(motion, rested, everywhere)["body_ari"] == 1
+    slow = torch.zeros_like(motion.scene_flow)
+    slow[:, 0, 0] = 0.002  # metres: neither moving nor still
+    statistics = motion_statistics(motion, Motion(slow, *list(vars(motion).values())[1:]), everywhere)
+    assert (statistics["still"] == 16 * 24).all() and not statistics["moving"].any()
+
+
 def test_the_models_own_motion_is_read_as_it_is(known, make_model):
     clips, _, motion = known
     rollout = unroll(make_model(), clips, CONTEXT, truth=1.0)

@@ -213,6 +213,16 @@ def test_scheduled_sampling_takes_the_share_of_true_frames_that_it_is_told(model
 
 
 @torch.no_grad()
+def test_a_coin_below_the_share_keeps_colour_and_depth_true(model, clips):
+    coins = torch.tensor([[0.9, 0.1, 0.9, 0.9], [0.9, 0.9, 0.1, 0.9], [0.9, 0.1, 0.1, 0.9]])
+    rollout = unroll(model, clips, 1, truth=0.5, coins=coins)
+    true = (coins < 0.5)[:, :-1]
+    depth = rollout.stack("points")[:, 1:, 2:]  # of the frames that predictions were made from
+    for seen, recorded in ((rollout.input_rgb[:, 1:], clips.rgb), (depth, clips.depth)):
+        assert torch.equal((seen == recorded[:, 1:-1]).flatten(2).all(2), true)
+
+
+@torch.no_grad()
 def test_actions_are_normalised_inside(make_model, clips):
     model = make_model()
     shifted, scaled = torch.linspace(-1, 1, 7), torch.linspace(0.5, 2, 7)

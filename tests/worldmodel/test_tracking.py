@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from envs.camera import CameraModel
-from worldmodel.tracking import HandTrack, SurfaceTrack, hand_pixels
+from worldmodel.geometry import pixel_grid
+from worldmodel.tracking import HandTrack, SurfaceTrack, _seen_at, hand_pixels
 
 BACKGROUND, HAND = 4.6, 4.2  # metres
 
@@ -111,6 +112,14 @@ def test_futures_are_apart_and_points_off_the_picture_do_no_harm(camera):
     track = track.advance(field, nothing_behind).advance(field, nothing_behind)
     np.testing.assert_allclose(track.tcp[0], tcp)
     np.testing.assert_allclose(track.tcp[1], tcp + 2 * far[1, :, 3])
+
+
+def test_fields_are_read_between_pixels_where_points_project_to():
+    wide = CameraModel.from_fovy(20, 10, 40.0, np.eye(4), 0.5, 5.0)
+    pixels = torch.tensor([[0.0, 0.0], [19.0, 9.0], [15.25, 2.5]], dtype=torch.float64)
+    rays = torch.cat([pixels, torch.ones(3, 1)], dim=1) @ torch.linalg.inv(intrinsics(wide)).T
+    seen = _seen_at(2.0 * rays[None], intrinsics(wide), pixel_grid(10, 20)[None])
+    np.testing.assert_allclose(seen[0], pixels, atol=1e-9)
 
 
 def on_the_hand(camera, pixels):
