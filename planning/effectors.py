@@ -25,12 +25,14 @@ class Effector(ABC):
 
     Attributes:
         axes: numbers in a move.
+        action_dim: numbers in an action of the environment.
         limit: the largest number in a planned move.
         metres: that a move of 1 goes in one control step.
         low, high: corners (3,) of the box that it stays in, metres.
     """
 
     axes: int
+    action_dim: int
     limit: float
     metres: float
     low: Array
@@ -60,7 +62,7 @@ class Effector(ABC):
 class Arm(Effector):
     """The arm of the tabletop: it is translated, never turned, and the gripper keeps its command of the start."""
 
-    axes, limit, metres = 3, 1.0, arm_control.ACTION_SCALE[0]
+    axes, action_dim, limit, metres = 3, 7, 1.0, arm_control.ACTION_SCALE[0]
     low, high = arm_control.WORKSPACE_LOW, arm_control.WORKSPACE_HIGH
 
     def reset(self, observation: Observation) -> None:
@@ -84,7 +86,7 @@ class Tip(Effector):
     models of pictures reach about as far as the tip then goes in a frame gap of 3.
     """
 
-    axes, limit, metres = 2, 0.5, push_control.ACTION_SCALE[0]
+    axes, action_dim, limit, metres = 2, 3, 0.5, push_control.ACTION_SCALE[0]
     low = np.append(push_control.WORKSPACE_LOW, TIP_HEIGHT)
     high = np.append(push_control.WORKSPACE_HIGH, TIP_HEIGHT)
 

@@ -100,7 +100,12 @@ def check_fits(name: str, model: WorldModel, dataset: RGBDDataset) -> list[str]:
     Raises:
         UsageError: the dataset has another camera or other actions than the model was trained on.
     """
-    given, wanted = Interface.of_data(dataset, model.context.action_column), Interface.of_model(model)
+    column, wanted = model.context.action_column, Interface.of_model(model)
+    if column not in ("action", "joint_delta") and set(dataset.attrs["action_aggregation"]) != {"last"}:
+        raise UsageError(
+            f"{name} was trained on absolute actions ('{column}'), and {dataset.path} has others; give data of its kind"
+        )
+    given = Interface.of_data(dataset, column)
     difference = mismatch(given, wanted)
     if difference is not None:
         raise UsageError(f"{dataset.path} has {difference}, which {name} was trained on; give data of its kind")

@@ -172,7 +172,7 @@ def _motion(section: str, prediction: CloudPrediction, scales: Scales) -> Image:
 
 
 def _scales(camera: CameraModel, clips: Clips, motion: TrueMotion | None, spatial: Sequence[Shown]) -> Scales:
-    """Colours over what the true clip spans; flow that nobody knows over what the first model predicts."""
+    """Colours over what the true clip spans; flow that nobody knows over what the first model predicts, less noise."""
     depth = clips.depth[0].cpu().numpy()
     inside = depth[depth < camera.far - 1e-3 * (camera.far - camera.near)]
     near, far = np.quantile(inside, (0.01, 0.99)) if inside.size else (camera.near, camera.far)
@@ -184,5 +184,7 @@ def _scales(camera: CameraModel, clips: Clips, motion: TrueMotion | None, spatia
         optical = torch.cat([prediction.optical_flow for prediction in spatial[0].clouds])
     else:
         scene, optical = torch.zeros(3, 1, 1), torch.zeros(2, 1, 1)
-    full = colours.full_length(scene, MOVES_M), colours.full_length(optical, MOVES_PX)
+    full = [colours.full_length(scene, MOVES_M), colours.full_length(optical, MOVES_PX)]
+    if motion is None:
+        full = [max(length, 10 * least) for length, least in zip(full, (MOVES_M, MOVES_PX), strict=True)]
     return Scales(float(near), float(far), *full)

@@ -5,9 +5,9 @@ foresight"): through the same kernels, blended by the same masks. What the mask 
 what it takes from the first frame is where the designated pixels were then; what it takes from the generated picture
 came from nowhere, so that this mass is lost. The rest is scaled up to sum 1.
 
-Among the pixels near a hand some show the table behind it, and the masks are soft: the mean of the distribution would lag
-behind the hand. So the track also adds up how far the kernels take what they move, as `HandTrack` sets the background
-apart for a model of rigid motions.
+Among the pixels near a hand some show the table behind it, and the masks are soft: the mean of the distribution would
+lag behind the hand. So the track also adds up how far the kernels take what they move, as `HandTrack` sets the
+background apart for a model of rigid motions.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class PixelTrack:
     Attributes:
         distribution: (N, H, W), sums to 1 in each future. N is 1 at the start, from which any number of futures begin.
             A future in which all mass was lost is NaN from then on.
-        shift: (N, 2), how far (u, v) the kernels have taken the mass that they moved, pixels; the mean at each step, added
-            up over the steps.
+        shift: (N, 2), how far (u, v) the kernels have taken the mass that they moved, pixels: the mean at each step,
+            added up over the steps.
         first: (1, H, W), the designated pixels of the first frame that the model was shown.
         box: the window outside of which there is no mass, in no future.
     """

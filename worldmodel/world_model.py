@@ -133,7 +133,15 @@ class WorldModel(nn.Module, ABC):
 
         Returns:
             The state at the last frame.
+
+        Raises:
+            UsageError: the shapes are others.
         """
+        batch, frames, _, height, width = rgb.shape if rgb.dim() == 5 else (0,) * 5
+        if frames < 1 or rgb.shape[2] != 3 or depth.shape != (batch, frames, 1, height, width):
+            raise UsageError(
+                f"rgb is {tuple(rgb.shape)} and depth {tuple(depth.shape)}; give (B, T, 3, H, W) and (B, T, 1, H, W)"
+            )
         memory = self.blank_memory(rgb[:, 0])
         for t in range(rgb.shape[1] - 1):
             action = None if actions is None else actions[:, t]

@@ -45,8 +45,11 @@ class HoldingController:
         follower: knows where the designated point is; when None it is the end-effector's own.
 
     Attributes:
+        knows: what it knows of a goal, `point_world` or `pixel`.
         plan_seconds: wall time of each decision of the current episode.
     """
+
+    knows = "point_world"
 
     def __init__(self, hold: int, effector: Effector | None = None, follower: Follower | None = None) -> None:
         self.hold = hold
@@ -55,6 +58,14 @@ class HoldingController:
         self.plan_seconds: list[float] = []
 
     def reset(self, observation: Observation, goal: Goal) -> None:
+        """See `Controller`.
+
+        Raises:
+            UsageError: the goal is no place.
+        """
+        place = np.asarray(getattr(goal, self.knows), np.float64)
+        if not np.isfinite(place).all():
+            raise UsageError(f"the goal's {self.knows} is {place.tolist()}; give finite numbers")
         self.goal = goal
         self.effector.reset(observation)
         self.follower.reset(observation, goal)

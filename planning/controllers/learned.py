@@ -33,7 +33,8 @@ class LearnedController(PlanningController):
         options: effector, follower, reach; see `PlanningController`.
 
     Raises:
-        UsageError: the model is of another kind, or was trained with another camera, or is to be shown no frame.
+        UsageError: the model is of another kind, was trained with another camera, takes other actions than the
+            effector's, or is to be shown no frame; in an episode: colours are not uint8.
 
     Attributes:
         kinds: of models that it can plan with; all, unless a subclass says otherwise.
@@ -65,6 +66,11 @@ class LearnedController(PlanningController):
                 " an environment with the model's"
             )
         super().__init__(planner, model.frame_gap, **options)
+        if model.action_dim != self.effector.action_dim:
+            raise UsageError(
+                f"the {model.kind} takes actions of {model.action_dim} numbers, those of the"
+                f" {type(self.effector).__name__} have {self.effector.action_dim}; give the effector of its environment"
+            )
         self.model, self.camera = model, camera
         self.context_frames = context_frames
         parameter = next(iter(model.parameters()), None)
@@ -84,6 +90,8 @@ class LearnedController(PlanningController):
 
     def watch(self, observation: Observation) -> None:
         """Take in a frame that the model is to be shown."""
+        if observation["rgb"].dtype != np.uint8:
+            raise UsageError(f"observation['rgb'] is {observation['rgb'].dtype}; give uint8 colours of 0 to 255")
         pixels = self.follower.pixels(observation, self.camera)
         if not self.frames:  # nothing came before: the first frame, standing still
             before = self.context_frames - 1

@@ -28,7 +28,7 @@ class PixelController(LearnedController):
         model, camera, planner, options: see `LearnedController`.
     """
 
-    kinds = PIXEL_MODELS
+    kinds, knows = PIXEL_MODELS, "pixel"
 
     def reset(self, observation: Observation, goal: Goal) -> None:
         super().reset(observation, replace(goal, point_world=np.full(3, np.nan)))

@@ -10,6 +10,7 @@ from planning.controllers.base import HoldingController
 from planning.controllers.baselines import LinearController, ProportionalController, RandomController
 from planning.controllers.pixel import PixelController
 from planning.controllers.t3vip import T3VIPController
+from planning.effectors import Tip
 from planning.icem import ICEM, ICEMConfig
 
 
@@ -136,6 +137,32 @@ def test_a_camera_that_the_model_does_not_know_is_refused(exact_model, camera, c
 
 def test_a_camera_may_stand_elsewhere(exact_model, camera):
     T3VIPController(exact_model, replace(camera, world_T_camera=np.eye(4)), planner())
+
+
+def test_a_model_of_other_actions_than_the_effectors_is_refused(exact_model, camera):
+    search = ICEM(ICEMConfig(), -0.5 * np.ones(2), 0.5 * np.ones(2), np.random.default_rng(0))
+    with pytest.raises(UsageError, match="the t3vip takes actions of 7 numbers, those of the Tip have 3; give the eff"):
+        T3VIPController(exact_model, camera, search, effector=Tip())
+
+
+def test_colours_must_be_as_the_environments_give_them(exact_model, camera, world, goal):
+    controller = T3VIPController(exact_model, camera, planner())
+    controller.reset(world.observation(), goal)
+    observation = world.observation()
+    with pytest.raises(UsageError, match=r"observation\['rgb'\] is float32; give uint8 colours of 0 to 255"):
+        controller.act({**observation, "rgb": observation["rgb"].astype(np.float32) / 255})
+
+
+def test_a_goal_must_be_a_place_that_the_controller_can_know(exact_model, pixel_model, camera, world, goal):
+    nowhere, unseen = replace(goal, point_world=np.full(3, np.nan)), replace(goal, pixel=np.array([np.inf, 3.0]))
+    spatial = T3VIPController(exact_model, camera, planner())
+    with pytest.raises(UsageError, match=r"the goal's point_world is \[nan, nan, nan\]; give finite numbers"):
+        spatial.reset(world.observation(), nowhere)
+    spatial.reset(world.observation(), unseen)
+    flat = PixelController(pixel_model, camera, planner())
+    with pytest.raises(UsageError, match=r"the goal's pixel is \[inf, 3.0\]"):
+        flat.reset(world.observation(), unseen)
+    flat.reset(world.observation(), nowhere)
 
 
 @pytest.mark.parametrize("frames", [0, -1])

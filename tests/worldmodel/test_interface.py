@@ -62,3 +62,10 @@ def test_a_model_is_held_against_the_column_that_it_takes(make_model, write_data
     model.context = replace(model.context, action_aggregation=("sum",) * 4, action_scale=(1.0,) * 4)
     with pytest.raises(UsageError, match="has action size 5, not 4, which model was trained on"):
         check_fits("model", model, RGBDDataset(folder))
+
+
+def test_a_model_of_absolute_actions_does_not_fit_others(make_model, write_dataset, tmp_path):
+    model, folder = make_model(), write_dataset(tmp_path / "data", [12, 12])
+    model.context = replace(model.context, action_column="action_followed")
+    with pytest.raises(UsageError, match=r"^hand was trained on absolute actions.* has others; give data of its kind"):
+        check_fits("hand", model, RGBDDataset(folder))

@@ -88,11 +88,14 @@ def test_kernels_and_masks_sum_to_one_and_every_kernel_counts(kind, clips, rival
 
 
 @pytest.mark.parametrize("kind", RIVALS)
+@pytest.mark.parametrize("size", [5, 9, 15])
 @torch.no_grad()
-def test_an_untrained_kernel_takes_most_from_the_pixel_itself(kind, clips, rival):
-    model, rgb = rival(kind), clips.rgb[:, 0]
+def test_an_untrained_kernel_takes_a_third_from_the_pixel_itself_whatever_its_size(kind, size, clips, rival):
+    model, rgb = rival(kind, kernel_size=size, masks=10), clips.rgb[:, 0]
     prediction, _ = model.predict(rgb, clips.depth[:, 0], clips.actions[:, 0], None, model.blank_memory(rgb))
-    assert prediction.kernels[..., 7, 7].mean() > 4 * prediction.kernels.mean()
+    centre = prediction.kernels[..., size // 2, size // 2]
+    assert 0.2 < centre.mean() < 0.5
+    assert prediction.kernels.std(dim=1).mean() > 0.1 / size**2  # and no two kernels are alike
 
 
 @pytest.mark.parametrize("kind", RIVALS)

@@ -68,6 +68,26 @@ def test_expected_distance_is_the_mean_over_the_spread():
     torch.testing.assert_close(track.expected_distance(torch.tensor([10.0, 9.0])), torch.tensor([3.0]))
 
 
+def test_the_hand_goes_as_far_as_what_the_kernels_move_of_its_pixels():
+    """A third of the pixels show the table, which stays; the mask of what moves is soft, and some of it is painted."""
+    track = PixelTrack.start(uniform_pixels(torch.tensor([SIZE * 20 + 20, SIZE * 20 + 21, SIZE * 20 + 30]), SIZE, SIZE))
+    moves = prediction([(4, -3), (0, 2)], sources=4)
+    moves.masks[:] = torch.tensor([0.2, 0.5, 0.2, 0.1])[:, None, None]
+    moves.masks[:, :, :, 27:] = torch.tensor([1.0, 0, 0, 0])[:, None, None]
+    track = track.advance(moves)
+    torch.testing.assert_close(track.shift, torch.tensor([[4.0, -3], [0, 2]]))
+    assert track.expected_position()[0, 0] < 23.67 + 2.5  # the mean lags behind
+    track = track.advance(moves)
+    torch.testing.assert_close(track.shift, torch.tensor([[8.0, -6], [0, 4]]))
+
+
+def test_a_hand_of_which_next_to_nothing_moves_stands_still():
+    moves = prediction([(4, 0), (4, 0)])
+    moves.masks[0], moves.masks[1] = (torch.tensor([1 - share, share, 0])[:, None, None] for share in (0.002, 0.0))
+    track = PixelTrack.start(one_hot(20, 20)).advance(moves)
+    torch.testing.assert_close(track.shift, torch.tensor([[0.4, 0], [0, 0]]))
+
+
 def test_what_the_generated_picture_covers_is_lost_and_the_rest_scaled_up():
     track = PixelTrack.start(uniform_pixels(torch.tensor([SIZE * 5 + 5, SIZE * 5 + 25]), SIZE, SIZE))
     half = prediction([(1, 0), (1, 0)])
@@ -85,6 +105,7 @@ def test_a_future_without_any_mass_left_has_no_place():
     track = PixelTrack.start(one_hot(8, 8)).advance(lost).advance(prediction([(1, 0), (1, 0)]))
     distance = track.expected_distance(torch.tensor([8.0, 8.0]))
     assert distance[0] == 1 and distance[1].isnan()
+    assert track.shift[0, 0] == 1 and track.shift[1].isnan().all()
 
 
 def test_the_first_frame_brings_back_where_the_pixels_were():

@@ -310,3 +310,15 @@ def test_a_tall_camera(make_model, camera_of):
     _, prediction = model.step(model.observe(rgb, depth), torch.zeros(2, 7))
     assert prediction.rgb.shape == (2, 3, 32, 8) and prediction.transform.shape == (2, 3, 4, 32, 8)
     assert prediction.rgb.isfinite().all()
+
+
+def test_frames_of_other_shapes_are_refused(model, clips):
+    rgb, depth = clips.rgb[:, :2], clips.depth[:, :2]
+    for pictures, depths in (
+        (rgb, depth[:, :, 0]),
+        (rgb[:, 0], depth),
+        (rgb[:, :0], depth[:, :0]),
+        (rgb, depth[:, :1]),
+    ):
+        with pytest.raises(UsageError, match=r"^rgb is \(.*; give \(B, T, 3, H, W\) and \(B, T, 1, H, W\)"):
+            model.observe(pictures, depths, clips.actions[:, :1])

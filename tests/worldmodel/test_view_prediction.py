@@ -240,6 +240,8 @@ def test_colours_mean_what_the_legends_say(shown):
     flow[0] = 0.043
     assert full_length(flow, 0.001) == pytest.approx(0.05)
     _, clips, truth, both = shown
+    unknown = storyboard(clips, None, 2, both).scales  # an untrained model's noise is no motion
+    assert unknown.scene_flow >= 0.01 and unknown.optical_flow >= 1.0
     board = storyboard(clips, truth, 2, both)
     for section in board.sections:
         drawn = legend(section, board.scales, 128, 128)
