@@ -71,6 +71,13 @@ def test_depth_comes_back_to_half_a_step(metres, near, span):
     np.testing.assert_allclose(back, np.clip(depth, near, far), atol=half_step + 1e-6, rtol=0)
 
 
+def test_depth_with_holes_is_refused_and_what_is_too_near_or_far_is_clipped():
+    with pytest.raises(UsageError, match="depth has NaN in 2 of 6 pixels; fill such holes"):
+        quantise_depth(np.array([[1.0, np.nan, 2.0], [np.nan, 1.0, 1.0]], np.float32), 0.5, 3.0)
+    clipped = quantise_depth(np.array([0.0, 0.5, 3.0, np.inf]), 0.5, 3.0)
+    assert clipped.tolist() == [0, 0, DEPTH_STEPS, DEPTH_STEPS]
+
+
 def test_reader_survives_spawn(folder):
     dataset = RGBDDataset(folder)
     dataset.load("rgb")  # used before it travels
