@@ -10,6 +10,7 @@ import os
 import select
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import is_dataclass
 from types import FrameType
@@ -148,9 +149,22 @@ def _tell(error: OSError) -> str | None:
     place, why = error.filename, error.strerror
     if error.errno in NO_ROOM:
         return f"cannot write {place or 'a file'} ({why}); make room, or choose a place that can be written to"
-    if isinstance(error, WRONG_PLACE) and place is not None:  # without a file, it is about a process or a socket
+    if place is None:  # it is about a process or a socket
+        return None
+    if isinstance(error, WRONG_PLACE) or _is_of_mkdir(error):
         return f"cannot read or write {place} ({why}); choose another place, or change what is there"
     return None
+
+
+def _is_of_mkdir(error: OSError) -> bool:
+    """Whether a folder that is not found is one that was to be made where none can be, as in /proc.
+
+    Where its parent is missing as well, or a file was to be opened, it is a bug.
+    """
+    if not isinstance(error, FileNotFoundError):
+        return False
+    raiser = traceback.extract_tb(error.__traceback__)[-1]
+    return raiser.name == "mkdir" and os.path.isdir(os.path.dirname(os.path.abspath(error.filename)))
 
 
 def _one_line(box: str) -> str:

@@ -129,6 +129,23 @@ def test_places_that_cannot_be_used_are_one_line(error, said, capsys):
     assert stop.value.code == 2 and err.startswith(f"error: {said}") and err.count("\n") == 1
 
 
+def test_a_folder_where_none_can_be_made_is_one_line(capsys):
+    with pytest.raises(SystemExit) as stop:
+        run(Nothing, lambda config: Path("/proc/there/is/none").mkdir(parents=True, exist_ok=True), [])
+    assert stop.value.code == 2
+    said = "error: cannot read or write /proc/there (No such file or directory); choose another place, "
+    err = capsys.readouterr().err
+    assert err.startswith(said) and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "look", [lambda path: path.mkdir(), lambda path: path.read_text(), lambda path: path.open("w")]
+)
+def test_a_missing_folder_that_nobody_made_keeps_its_traceback(look, tmp_path):
+    with pytest.raises(FileNotFoundError):
+        run(Nothing, lambda config: look(tmp_path / "never" / "made"), [])
+
+
 @pytest.mark.parametrize(
     "error", [PermissionError(errno.EPERM, "no such right"), FileNotFoundError(errno.ENOENT, "no", "a")]
 )
