@@ -89,6 +89,12 @@ class RGBDDataset:
     def __len__(self) -> int:
         return len(self.episode_lengths)
 
+    def __getitem__(self, number: int) -> dict[str, NDArray[Any]]:
+        """As `episode`; negative numbers count from the end."""
+        if not -self.episodes <= number < self.episodes:
+            raise IndexError(f"episode {number} of a dataset of {self.episodes}")
+        return self.episode(number % self.episodes)
+
     @property
     def episodes(self) -> int:
         """Number of episodes."""

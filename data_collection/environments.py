@@ -46,7 +46,7 @@ KNOWN_ENVS: dict[str, KnownEnv] = {
 
 
 def resolve_env(name: str, scene: str | None) -> tuple[str, dict[str, Any]]:
-    """Short name, or any Gymnasium id ("package/Name-v0", "module:Name-v0") -> (Gymnasium id, keyword arguments).
+    """Short name, or any Gymnasium id (such as "module:Name-v0") -> (Gymnasium id, keyword arguments).
 
     Args:
         name: the short name or the id.
@@ -55,9 +55,11 @@ def resolve_env(name: str, scene: str | None) -> tuple[str, dict[str, Any]]:
     Raises:
         UsageError: unknown name or scene.
     """
-    if name not in KNOWN_ENVS and not ("/" in name or ":" in name):
-        known_names = ", ".join(KNOWN_ENVS)
-        raise UsageError(f"no environment named '{name}'; choose one of {known_names}, or give a Gymnasium id")
+    if not (name in KNOWN_ENVS or name in gymnasium.registry or "/" in name or ":" in name):
+        raise UsageError(
+            f"no environment named '{name}'; choose one of {', '.join(KNOWN_ENVS)}, or give a Gymnasium id, as "
+            "module:Name-v0, which imports the module first"
+        )
     ours = known_env(name)
     known = KNOWN_ENVS.get(name) or KnownEnv(name, kwargs=ours.kwargs if ours else {})
     if scene is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import defaultdict
 from collections.abc import Iterator
 
 import numpy as np
@@ -24,9 +25,15 @@ def shared_episodes(ours: RGBDDataset, theirs: RGBDDataset) -> list[int]:
     """
     if ours.content_hash == theirs.content_hash:
         return list(range(theirs.episodes))
-    known = {key: number for number, key in enumerate(_keys(ours))}
+    known: dict[bytes, list[int]] = defaultdict(list)  # several of ours may differ in nothing but what is seen
+    for number, key in enumerate(_keys(ours)):
+        known[key].append(number)
     alike = [(known[key], number) for number, key in enumerate(_keys(theirs)) if key in known]
-    return [number for ours_at, number in alike if np.array_equal(_end(ours, ours_at), _end(theirs, number))]
+    return [
+        number
+        for candidates, number in alike
+        if any(np.array_equal(_end(ours, candidate), _end(theirs, number)) for candidate in candidates)
+    ]
 
 
 def _keys(dataset: RGBDDataset) -> Iterator[bytes]:

@@ -39,8 +39,8 @@ def collect_episode(
         the columns of the schema, (steps + 1, ...) each, and whether the episode ended in a terminal state.
 
     Raises:
-        UsageError: the environment gave colours or ids that a dataset does not store, or its `info` has something in
-            some steps only.
+        UsageError: the environment gave colours, ids or depth that a dataset does not store, or its `info` has
+            something in some steps only.
     """
     env_seeds, policy_seeds = np.random.SeedSequence((seed, episode)).spawn(2)
     obs, info = env.reset(seed=int(env_seeds.generate_state(1)[0] >> 1))

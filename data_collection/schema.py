@@ -115,7 +115,16 @@ class Shard:
 
 
 def quantise_depth(metres: NDArray[Any], near: float, far: float) -> NDArray[np.uint16]:
-    """Depth in metres, any shape -> uint16 over [near, far], clipped to it."""
+    """Depth in metres, any shape -> uint16 over [near, far], clipped to it.
+
+    Raises:
+        UsageError: it has NaN, which cast to a whole number would be a surface at the near plane.
+    """
+    holes = np.count_nonzero(np.isnan(metres))
+    if holes:
+        raise UsageError(
+            f"depth has NaN in {holes} of {np.size(metres)} pixels; fill such holes first, as with what is around them"
+        )
     unit = (np.asarray(metres, np.float64) - near) / (far - near)
     return np.rint(np.clip(unit, 0.0, 1.0) * DEPTH_STEPS).astype(np.uint16)
 

@@ -10,9 +10,11 @@ import os
 import select
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Sequence
+from dataclasses import is_dataclass
 from types import FrameType
-from typing import TypeVar
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -89,14 +91,15 @@ def parse(
     """The options of a command.
 
     Raises:
-        UsageError: they do not parse, or `config` refuses them.
+        UsageError: they do not parse, one that takes several values is given more than once, or `config` refuses them.
     """
     box, about = io.StringIO(), inspect.getdoc(config)
+    given = sys.argv[1:] if args is None else args
+    _refuse_repeats(config, given)
     try:
         with contextlib.redirect_stderr(box):
             if default is None:
-                return tyro.cli(config, args=args, description=about)
-            given = sys.argv[1:] if args is None else args
+                return tyro.cli(config, args=given, description=about)
             return tyro.cli(config, args=given, description=about, default=default(given))
     except SystemExit as stop:
         if stop.code != 2:  # --help
@@ -105,6 +108,33 @@ def parse(
         while cause is not None and not isinstance(cause, UsageError):
             cause = cause.__context__
     raise cause or UsageError(_one_line(box.getvalue()))
+
+
+def _refuse_repeats(config: type[Any], given: Sequence[str]) -> None:
+    """Refuse a list that is given piece by piece: of an option that comes twice the last one counts."""
+    spellings = _list_options(config)
+    words = [word.partition("=")[0].replace("_", "-") for word in given]
+    lists = [spellings[word] for word in words if word in spellings]
+    for option in lists:
+        if lists.count(option) > 1:
+            raise UsageError(
+                f"{option} is given {lists.count(option)} times, of which only the last would count; "
+                f"give all values at once: {option} VALUE VALUE"
+            )
+
+
+def _list_options(config: type[Any], prefix: str = "--") -> dict[str, str]:
+    """Every spelling of an option that takes any number of values, nested groups' too -> the option's own name."""
+    found: dict[str, str] = {}
+    for name, hint in get_type_hints(config, include_extras=True).items():
+        option = prefix + name.replace("_", "-")
+        kind, *notes = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+        if is_dataclass(kind):
+            found |= _list_options(kind, f"{option}.")  # type: ignore[arg-type]
+        elif get_origin(kind) is list or ... in get_args(kind):
+            aliases = [alias for note in notes for alias in getattr(note, "aliases", None) or ()]
+            found |= dict.fromkeys((option, *aliases), option)
+    return found
 
 
 def _reader_is_gone() -> bool:
@@ -119,9 +149,22 @@ def _tell(error: OSError) -> str | None:
     place, why = error.filename, error.strerror
     if error.errno in NO_ROOM:
         return f"cannot write {place or 'a file'} ({why}); make room, or choose a place that can be written to"
-    if isinstance(error, WRONG_PLACE) and place is not None:  # without a file, it is about a process or a socket
+    if place is None:  # it is about a process or a socket
+        return None
+    if isinstance(error, WRONG_PLACE) or _is_of_mkdir(error):
         return f"cannot read or write {place} ({why}); choose another place, or change what is there"
     return None
+
+
+def _is_of_mkdir(error: OSError) -> bool:
+    """Whether a folder that is not found is one that was to be made where none can be, as in /proc.
+
+    Where its parent is missing as well, or a file was to be opened, it is a bug.
+    """
+    if not isinstance(error, FileNotFoundError):
+        return False
+    raiser = traceback.extract_tb(error.__traceback__)[-1]
+    return raiser.name == "mkdir" and os.path.isdir(os.path.dirname(os.path.abspath(error.filename)))
 
 
 def _one_line(box: str) -> str:

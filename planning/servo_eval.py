@@ -108,7 +108,11 @@ class ServoConfig:
         return TASKS[self.env, self.point]
 
     def checkpoints(self) -> dict[str, str]:
-        """World model -> its weights, as given."""
+        """World model -> its weights, as given.
+
+        Raises:
+            UsageError: weights for no model of this run, or for one model twice.
+        """
         learned = [name for name in self.model if name in LEARNED]
         given: dict[str, str] = {}
         for entry in self.checkpoint:
@@ -122,6 +126,8 @@ class ServoConfig:
                 name, path = learned[0], entry
             if name not in learned:
                 raise UsageError(f"--checkpoint {entry} is for '{name}'; learned models of this run: {learned}")
+            if name in given:
+                raise UsageError(f"--checkpoint {entry} is a second one for '{name}'; give one folder per model")
             given[name] = path
         return given
 

@@ -12,6 +12,7 @@ from envs.dexhand import control
 from envs.dexhand.goals import HOME, is_dropped, random_turn
 from envs.dexhand.scene import SUBSTEPS
 from envs.errors import UsageError
+from envs.reset_options import option_numbers
 
 POSTURE_SPREAD = 0.12  # standard deviation of each action number about the middle, where the hand is a bowl
 FALL, PLACE_SPREAD = 0.03, 0.004  # m, above where the cube comes to lie; standard deviation in x and y
@@ -63,7 +64,7 @@ def _take_posture(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 def unit_quaternion(name: str, value: ArrayLike) -> Array:
     """The option of this name as a quaternion (4,) of length 1."""
-    quaternion = np.asarray(value, np.float64)
-    if quaternion.shape != (4,) or not 0.5 < np.linalg.norm(quaternion) < 2:
+    quaternion = option_numbers(name, value, 4)
+    if not 0.5 < np.linalg.norm(quaternion) < 2:
         raise UsageError(f"the option {name} is {value!r}; give a unit quaternion (w, x, y, z)")
     return quaternion / np.linalg.norm(quaternion)

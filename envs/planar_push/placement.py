@@ -15,6 +15,7 @@ from envs.planar_push import objects, pieces
 from envs.planar_push.control import WORKSPACE_HIGH, WORKSPACE_LOW
 from envs.planar_push.hidden import Hidden
 from envs.planar_push.scene import TIP_RADIUS
+from envs.reset_options import option_numbers
 
 OBJECT_AREA = 0.07  # m, half the side of the square that the object's middle starts in
 TIP_DISTANCE = (0.10, 0.16)  # m, from the middle of the object
@@ -47,10 +48,10 @@ class Start:
             given = options["hidden"]
             changes["hidden"] = given if isinstance(given, Hidden) else Hidden.from_vector(given)
         if "pose" in options:
-            changes["pose"] = _numbers("pose", options["pose"], 3)
+            changes["pose"] = option_numbers("pose", options["pose"], 3)
             changes["tip"] = self.tip + changes["pose"][:2] - self.pose[:2]
         if "tip" in options:
-            changes["tip"] = _numbers("tip", options["tip"], 2)
+            changes["tip"] = option_numbers("tip", options["tip"], 2)
         start = dataclasses.replace(self, **changes)
         if "pose" in options and "tip" not in options:
             return start._with_tip_beside()
@@ -88,13 +89,3 @@ def draw(names: Sequence[str], rng: np.random.Generator) -> Start:
     bearing, distance = rng.uniform(-np.pi, np.pi), rng.uniform(*TIP_DISTANCE)
     tip = place + distance * np.array([np.cos(bearing), np.sin(bearing)])
     return Start(name, hidden, np.append(place, yaw), tip, int(rng.integers(2**53)))
-
-
-def _numbers(name: str, value: Any, count: int) -> NDArray[np.float64]:
-    try:
-        numbers = np.asarray(value, np.float64)
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"option {name} is {value!r}; give {count} numbers") from error
-    if numbers.shape != (count,) or not np.isfinite(numbers).all():
-        raise UsageError(f"option {name} is {value!r}; give {count} finite numbers")
-    return numbers

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from envs import rotations
 from envs.errors import UsageError
+from envs.reset_options import option_numbers
 from envs.tabletop import table
 from envs.tabletop.control import WORKSPACE_HIGH, WORKSPACE_LOW, Pose
 from envs.tabletop.kinematics import ArmKinematics
@@ -62,14 +63,12 @@ def place_arm(model: mujoco.MjModel, data: mujoco.MjData, kinematics: ArmKinemat
 
 
 def place_arm_at(model: mujoco.MjModel, data: mujoco.MjData, kinematics: ArmKinematics, place: ArrayLike) -> None:
-    """The hand at a given place, pointing down.
+    """The hand at a given place (3,) in metres, pointing down.
 
     Raises:
         UsageError: no such place, or it is out of reach, or something is in the way.
     """
-    position = np.asarray(place, np.float64)
-    if position.shape != (3,) or not np.isfinite(position).all():
-        raise UsageError(f"option tcp is {place!r}; give three coordinates in metres")
+    position = option_numbers("tcp", place, 3)
     if (position < WORKSPACE_LOW).any() or (position > WORKSPACE_HIGH).any():
         low, high = WORKSPACE_LOW.tolist(), WORKSPACE_HIGH.tolist()
         raise UsageError(f"option tcp {position.tolist()} is outside the workspace; stay between {low} and {high}")

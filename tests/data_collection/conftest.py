@@ -1,15 +1,11 @@
 import sys
 from pathlib import Path
 
-import hypothesis
 import pytest
 
 HERE = Path(__file__).parent
 if str(HERE) not in sys.path:  # spawned workers inherit it and find `standin`
     sys.path.insert(0, str(HERE))
-
-hypothesis.settings.register_profile("no deadline", deadline=None)  # a busy machine is no failure
-hypothesis.settings.load_profile("no deadline")
 
 
 @pytest.fixture(scope="session")

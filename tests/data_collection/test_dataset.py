@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from shards import ATTRS, CAMERA, flip_a_byte_of, make_episode
+from torch.utils.data import DataLoader
 
 from data_collection import writer
 from data_collection.dataset import RGBDDataset
@@ -69,6 +70,35 @@ def test_depth_comes_back_to_half_a_step(metres, near, span):
     assert back.dtype == np.float32
     half_step = span / DEPTH_STEPS / 2
     np.testing.assert_allclose(back, np.clip(depth, near, far), atol=half_step + 1e-6, rtol=0)
+
+
+def test_depth_with_holes_is_refused_and_what_is_too_near_or_far_is_clipped():
+    with pytest.raises(UsageError, match="depth has NaN in 2 of 6 pixels; fill such holes"):
+        quantise_depth(np.array([[1.0, np.nan, 2.0], [np.nan, 1.0, 1.0]], np.float32), 0.5, 3.0)
+    clipped = quantise_depth(np.array([0.0, 0.5, 3.0, np.inf]), 0.5, 3.0)
+    assert clipped.tolist() == [0, 0, DEPTH_STEPS, DEPTH_STEPS]
+
+
+def test_a_dataset_is_a_sequence_of_episodes(folder):
+    dataset = RGBDDataset(folder)
+    for number, episode in enumerate(dataset):
+        same = dataset[number - len(dataset)]
+        for name, values in dataset.episode(number).items():
+            np.testing.assert_array_equal(episode[name], values)
+            np.testing.assert_array_equal(same[name], values)
+    assert number + 1 == len(dataset) == dataset.episodes
+    for number in (len(dataset), -len(dataset) - 1):
+        with pytest.raises(IndexError, match=f"episode {number} of a dataset of {len(dataset)}"):
+            dataset[number]
+
+
+def test_pytorch_loads_episodes(folder):
+    dataset = RGBDDataset(folder)
+    loaded = list(DataLoader(dataset, batch_size=None, num_workers=1))
+    assert len(loaded) == len(dataset)
+    for number, episode in enumerate(loaded):
+        for name, values in dataset[number].items():
+            np.testing.assert_array_equal(episode[name].numpy(), values)
 
 
 def test_reader_survives_spawn(folder):

@@ -43,3 +43,11 @@ def test_the_same_moves_among_other_things_are_another_episode(write, episodes):
     moved = dict(episodes[0], depth=episodes[0]["depth"].copy())
     moved["depth"][-1, 0, 0] ^= 1
     assert shared_episodes(write("here", episodes[:2]), write("there", [moved, episodes[1]])) == [1]
+
+
+def test_an_episode_is_found_among_several_of_the_same_moves(write, episodes):
+    moved = dict(episodes[0], depth=episodes[0]["depth"].copy())
+    moved["depth"][-1, 0, 0] ^= 1
+    ours = write("ours", [episodes[0], moved, episodes[1]])
+    assert shared_episodes(ours, write("first", [episodes[0]])) == [0]
+    assert shared_episodes(ours, write("second", [moved])) == [0]

@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+from commands import assert_one_line_error, call, options
 from standin import StandIn
 
 from data_collection.environments import make_env
@@ -63,6 +64,24 @@ class Liar(StandIn):
 
     def _observe(self):
         return {**super()._observe(), "rgb": np.full((16, 16, 3), 0.5)}
+
+
+class Holey(StandIn):
+    """Has no depth for one pixel."""
+
+    def _observe(self):
+        observation = super()._observe()
+        observation["depth"][3, 4] = np.nan
+        return observation
+
+
+gymnasium.register("requirements/Holey-v0", entry_point=Holey)
+
+
+def test_depth_with_holes_is_refused_in_one_line(tmp_path):
+    result = call("collect-rollouts", options(tmp_path, env="test_requirements:requirements/Holey-v0"))
+    assert_one_line_error(result, "depth has NaN in 1 of 256 pixels", "fill such holes first")
+    assert "lost episode" not in result[2] and not list(tmp_path.glob("*.h5"))
 
 
 class Crowd(StandIn):

@@ -314,6 +314,7 @@ def test_bad_input_is_named(blind_c):
         (lambda: blind_c.reset(options={"hand": 1}), "hand"),
         (lambda: blind_c.reset(options={"arm": "up"}), "up"),
         (lambda: blind_c.reset(options={"tcp": [0, 0, 9]}), "9"),
+        (lambda: blind_c.reset(options={"tcp": "x"}), "option tcp is 'x'; give 3 numbers"),
         (lambda: blind_c.reset(options={"tcp": [0.0, -0.1, 0.40]}), "inside"),
         (lambda: blind_c.reset(options={"tcp": [0.34, 0.10, 0.78]}), "reach"),
         (lambda: blind_c.view("top"), "top"),

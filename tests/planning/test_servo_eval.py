@@ -197,6 +197,7 @@ def test_repeats_share_a_setup_but_not_their_randomness():
         (["--planner.horizon", 0], "horizon"),
         (["--model", "random", "--checkpoint", "/nowhere"], "checkpoint"),
         (["--checkpoint", "sv2p=/nowhere"], "sv2p"),
+        (["--checkpoint", "t3vip=/a", "t3vip=/b"], "--checkpoint t3vip=/b is a second one for 't3vip'"),
         (["--deadline", "-1"], "deadline"),
         (["--env", "planar-push", "--model", "sna"], "no sna ships for t3vip/PlanarPush-v0; train one and give it"),
     ],

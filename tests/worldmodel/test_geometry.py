@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from envs.camera import CameraModel
 from worldmodel import geometry
 
-QUICK = settings(max_examples=25, deadline=None)
+QUICK = settings(max_examples=25)
 seeds = st.integers(0, 2**32 - 1)
 
 
