@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,14 +18,14 @@ from data_collection.environments import (
     usual_steps,
     versions,
 )
-from data_collection.files import locked, remove_leftovers
+from data_collection.files import LOCK_NAME, locked, remove_leftovers
 from data_collection.manifest import MANIFEST_NAME, Manifest, read_manifest
 from data_collection.policies import POLICIES
 from data_collection.policies.stable_baselines import SUFFIX, policy_name
 from data_collection.process_workers import ProcessPool
 from data_collection.ray_cluster import connect
 from data_collection.schema import SHARD_PATTERN, read_shard
-from data_collection.workers import Collected, WorkerLost, collect_episodes
+from data_collection.workers import ERROR_LOG, Collected, WorkerLost, collect_episodes
 from data_collection.writer import shard_path
 from envs.command import end_on_sigterm, run
 from envs.errors import UsageError
@@ -109,8 +110,9 @@ class Config:
 def main(config: Config) -> None:
     """Collect the episodes that the dataset does not have yet."""
     manifest, folder = config.manifest(), config.out
+    new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder):
+    with locked(folder), _cleared_if_in_vain(folder) if new else contextlib.nullcontext():
         _begin(manifest, folder)
         missing = [number for number in range(config.episodes) if not shard_path(folder, number).exists()]
         done = config.episodes - len(missing)
@@ -138,6 +140,21 @@ def _collect(config: Config, manifest: Manifest, missing: list[int]) -> Iterator
         if on_ray.cpus < workers:
             print(f"the Ray cluster has {on_ray.cpus} CPUs: so many workers, not {workers}", file=sys.stderr)
         yield from collect_episodes(on_ray, folder, missing, max(1, min(workers, on_ray.cpus)))
+
+
+@contextlib.contextmanager
+def _cleared_if_in_vain(folder: Path) -> Iterator[None]:
+    """Remove a folder that was made for episodes of which none came; the log of what failed keeps it."""
+    try:
+        yield
+    except BaseException:
+        if not any(folder.glob(SHARD_PATTERN)) and not (folder / ERROR_LOG).exists():
+            remove_leftovers(folder)
+            for name in (MANIFEST_NAME, LOCK_NAME):
+                (folder / name).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # somebody else put something there
+                folder.rmdir()
+        raise
 
 
 def _begin(manifest: Manifest, folder: Path) -> None:

@@ -256,6 +256,14 @@ def test_policy_of_another_environment_is_told_at_once_and_leaves_the_folder_fre
     assert json.loads((tmp_path / "dataset.json").read_text())["policy"] == "noise"
 
 
+def test_options_that_cannot_work_leave_no_folder_behind(tmp_path):
+    assert_one_line_error(call("collect-rollouts", options(tmp_path / "data", policy="play")), "'play' cannot act")
+    assert not (tmp_path / "data").exists()
+    (tmp_path / "mine").mkdir()
+    assert_one_line_error(call("collect-rollouts", options(tmp_path / "mine", policy="play")), "'play' cannot act")
+    assert (tmp_path / "mine").exists()
+
+
 def test_environment_that_does_not_observe_depth(tmp_path):
     with pytest.raises(UsageError, match="has no attribute 'camera'"):
         main(Config(**arguments(tmp_path, env="standin:standin/Blind-v0")))
