@@ -35,7 +35,7 @@ class LossWeights:
     """lambda_5, second differences of optical flow, pixels."""
     kl: float = 0.1
     """lambda_6, divergence of the latents from the prior, nats a pixel. With 1e-3 latents told the model how
-    everything moves, and it did not learn that from the actions. (The reference's 1e-3 is of a unit 512 times larger.)"""
+    everything moves, and it did not learn that from the actions. (The reference's is of a unit 512 times larger.)"""
     power: Literal[1, 2] = 1
     """alpha: 1 for absolute, 2 for squared reconstruction errors."""
     alignment: Literal["knn", "chamfer"] = "knn"
