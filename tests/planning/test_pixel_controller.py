@@ -8,6 +8,7 @@ import torch
 
 from planning.controllers import CONTROLLERS, LEARNED, PIXEL_MODELS
 from planning.controllers.pixel import PixelController
+from planning.costs import Reach
 from planning.icem import ICEM, ICEMConfig
 
 
@@ -105,7 +106,8 @@ def test_designated_are_the_pixels_of_the_hand_in_both_frames(pixel_model, camer
     assert now.sum() == pytest.approx(1) and 15 <= (now > 0).sum() <= 30
     assert not torch.equal(before, now)
 
-    # A model that copies the first frame only: whatever is done, the hand will be where it was then.
+    # A model that copies the first frame only: its kernels move nothing, so that the hand stands still; a thing will be
+    # where it was then.
     predict = pixel_model.predict
 
     def first_only(shift):
@@ -115,12 +117,16 @@ def test_designated_are_the_pixels_of_the_hand_in_both_frames(pixel_model, camer
         return dataclasses.replace(prediction, masks=masks)
 
     pixel_model.predict = first_only
-    costs = controller.imagine(controller.frames[1])(np.random.default_rng(0).uniform(-1, 1, (5, 2, 3)))
-    grid = np.stack(np.meshgrid(np.arange(64), np.arange(64)), axis=-1)
-    hand = np.array((now[..., None] * torch.from_numpy(grid)).sum((0, 1)))
+    moves = np.random.default_rng(0).uniform(-1, 1, (5, 2, 3))
+    costs = controller.imagine(controller.frames[1])(moves)
     tcp = camera.project(camera.to_camera(np.float32(controller.frames[1]["proprio"][:3])))
-    then = np.array((before[..., None] * torch.from_numpy(grid)).sum((0, 1)))
-    np.testing.assert_allclose(costs, (1 + 0.95) * np.linalg.norm(then + tcp - hand - goal.pixel), rtol=1e-4)
+    np.testing.assert_allclose(costs, (1 + 0.95) * np.linalg.norm(tcp - goal.pixel), rtol=1e-4)
+    controller.reach = Reach(weight=0.0, beyond=0.0)
+    costs = controller.imagine(controller.frames[1])(moves)
+    grid = np.stack(np.meshgrid(np.arange(64), np.arange(64)), axis=-1)
+    offset = tcp - np.array((now[..., None] * torch.from_numpy(grid)).sum((0, 1)))
+    distances = np.linalg.norm(grid + offset - goal.pixel, axis=-1)
+    np.testing.assert_allclose(costs, (1 + 0.95) * (before.numpy() * distances).sum(), rtol=1e-4)
 
 
 def test_a_hand_lost_from_the_picture_costs_infinitely(pixel_model, camera, world, goal):

@@ -67,7 +67,8 @@ def shown(make_model, make_rival, source):
 
 def view(data, models, out, *more):
     clip = ("--context", "2", "--predicted", "3", "--episode", str(EPISODE))
-    given = ("--models", *map(str, models), "--out", *map(str, out if isinstance(out, list) else [out]))
+    given = () if "--models" in more else ("--models", *map(str, models))
+    given += () if "--out" in more else ("--out", *map(str, out if isinstance(out, list) else [out]))
     run(ViewOptions, main, ["--data", str(data), *given, *clip, *more])
 
 
