@@ -39,7 +39,8 @@ def start(
         UsageError: an option does not fit, or the cube does not stay in a hand like this.
     """
     for _ in range(TRIES):
-        hand = options.get("hand", rng.normal(0, POSTURE_SPREAD, control.ACTUATORS))
+        drawn = rng.normal(0, POSTURE_SPREAD, control.ACTUATORS)
+        hand = option_numbers("hand", options["hand"], control.ACTUATORS) if "hand" in options else drawn
         turn = unit_quaternion("cube", options["cube"]) if "cube" in options else random_turn(np.pi, rng)
         mujoco.mj_resetData(model, data)
         data.ctrl[:] = control.joint_targets(model, control.check_action(hand))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from envs.errors import UsageError
 from envs.planar_push import objects, pieces
 from envs.planar_push.control import WORKSPACE_HIGH, WORKSPACE_LOW
-from envs.planar_push.hidden import Hidden
+from envs.planar_push.hidden import NUMBERS, Hidden
 from envs.planar_push.scene import TIP_RADIUS
 from envs.reset_options import option_numbers
 
@@ -46,7 +46,9 @@ class Start:
             changes["object_name"] = objects.canonical(options["object"])
         if "hidden" in options:
             given = options["hidden"]
-            changes["hidden"] = given if isinstance(given, Hidden) else Hidden.from_vector(given)
+            if not isinstance(given, Hidden):
+                given = Hidden.from_vector(option_numbers("hidden", given, NUMBERS))
+            changes["hidden"] = given
         if "pose" in options:
             changes["pose"] = option_numbers("pose", options["pose"], 3)
             changes["tip"] = self.tip + changes["pose"][:2] - self.pose[:2]

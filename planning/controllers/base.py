@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from typing import Protocol
 
 import numpy as np
@@ -134,7 +135,15 @@ class PlanningController(HoldingController):
         self.planner.reset()
 
     def decide(self, observation: Observation) -> NDArray:
-        return self.planner.plan(self.imagine(observation)).actions[0]
+        plan = self.planner.plan(self.imagine(observation))
+        if not np.isfinite(plan.cost):
+            warnings.warn(
+                f"{type(self).__name__} found no move of finite cost, and goes on as it last planned: what it predicts"
+                " is not finite, as with a model whose weights or frames are not",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        return plan.actions[0]
 
     def imagine(self, observation: Observation) -> CostFunction:
         """The cost of sequences of held moves (N, horizon, axes), as a function, from this observation on."""

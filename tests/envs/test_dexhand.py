@@ -224,7 +224,9 @@ def test_bad_input_is_named(blind):
         (lambda: blind.reset(options={"cube": [0, 0, 0, 0]}), "cube"),
         (lambda: blind.reset(options={"goal": [1, 0, 0]}), "goal"),
         (lambda: blind.reset(options={"goal": "up"}), "option goal is 'up'; give 4 numbers"),
-        (lambda: blind.reset(options={"hand": np.zeros(3)}), r"\(3,\)"),
+        (lambda: blind.reset(options={"hand": np.zeros(3)}), "option hand is .*; give 20 finite numbers"),
+        (lambda: blind.reset(options={"hand": "fist"}), "option hand is 'fist'; give 20 numbers"),
+        (lambda: blind.step("up"), "the action is 'up'"),
         (lambda: blind.view("top"), "top"),
         (lambda: BatchSimulator(blind, 1).rollout(blind.get_state(), np.zeros((2, 3, 3))), r"\(2, 3, 3\)"),
     ]

@@ -334,7 +334,8 @@ def test_bad_input_is_named(blind):
         (lambda: blind.reset(options={"pose": [0.5, 0, 0]}), r"pose \[0.5, 0.0, 0.0\] leaves the tip no place"),
         (lambda: blind.reset(options={"tip": [0.3, 0]}), "0.3"),
         (lambda: blind.reset(options={"pose": [0, 0, 0], "tip": [0.01, 0]}), "inside"),
-        (lambda: blind.reset(options={"hidden": [1, 2]}), r"\(2,\)"),
+        (lambda: blind.reset(options={"hidden": [1, 2]}), r"option hidden is \[1, 2\]; give 7 finite numbers"),
+        (lambda: blind.reset(options={"hidden": "heavy"}), "option hidden is 'heavy'; give 7 numbers"),
         (lambda: blind.reset(options={"hidden": [0, 0, 0, 0, 0, 1, 1]}), "mass"),
         (lambda: blind.view("top"), "top"),
     ]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from envs.errors import UsageError
-from planning.controllers.base import HoldingController
+from planning.controllers.base import HoldingController, PlanningController
 from planning.controllers.baselines import LinearController, ProportionalController, RandomController
 from planning.controllers.pixel import PixelController
 from planning.controllers.t3vip import T3VIPController
@@ -179,3 +179,15 @@ def test_an_episode_begins_with_reset(world):
 def test_holding_is_an_interface():
     with pytest.raises(NotImplementedError):
         HoldingController(3).decide({})
+
+
+def test_plans_without_a_finite_cost_are_told(world, goal):
+    class Blind(PlanningController):
+        def imagine(self, observation):
+            return lambda moves: np.full(len(moves), np.nan)
+
+    controller = Blind(planner(), hold=3)
+    controller.reset(world.observation(), goal)
+    with pytest.warns(RuntimeWarning, match="Blind found no move of finite cost"):
+        action = controller.act(world.observation())
+    assert np.isfinite(action).all()
