@@ -161,6 +161,22 @@ def _drop_table(path):
         del file["ep_len"]
 
 
+def _shorten_table(name):
+    def damage(path):
+        with h5py.File(path, "a") as file:
+            values = file[name][()]
+            del file[name]
+            file[name] = values[..., :-1]
+
+    return damage
+
+
+def _make_a_group_of_a_column(path):
+    with h5py.File(path, "a") as file:
+        del file["state"]
+        file.create_group("state")
+
+
 def _shorten_column(path):
     with h5py.File(path, "a") as file:
         values = file["reward"][:-1]
@@ -183,6 +199,8 @@ def _retype_column(path):
         _empty,
         _spoil_attribute,
         _drop_table,
+        *map(_shorten_table, ("ep_len", "ep_index", "ep_hash")),
+        _make_a_group_of_a_column,
         _shorten_column,
         _retype_column,
     ],
@@ -252,6 +270,30 @@ def test_shards_of_different_datasets(folder, episodes):
         RGBDDataset(folder)
 
 
+def test_shards_whose_optional_columns_differ(tmp_path):
+    rng = np.random.default_rng(0)
+    for number, bodies in enumerate((3, 2)):
+        episode = make_episode(rng, 4, ground_truth=True)
+        episode["body_pose"] = episode["body_pose"][:, :bodies]
+        write_shard(tmp_path / f"shard-0000{number}.h5", [episode], ATTRS, [number])
+    with pytest.raises(UsageError, match=r"column 'body_pose' has rows of \(2, 7\) in .*1\.h5 but \(3, 7\)"):
+        RGBDDataset(tmp_path)
+
+
+def test_what_else_is_in_a_shard_is_left_alone(folder, episodes):
+    before = RGBDDataset(folder)
+    with h5py.File(folder / "shard-00000.h5", "a") as file:
+        file["notes/operator"] = np.arange(3)
+        file["ep_language"] = ["push", "pull"]
+        file.attrs["operator"], file.attrs["offset"] = "Anna", np.arange(3.0)
+        file.attrs["tags"], file.attrs["nothing"] = [b"a", b"b"], h5py.Empty("f4")
+    after = RGBDDataset(folder)
+    assert after.columns == before.columns and after.content_hash == before.content_hash
+    assert after.attrs["operator"] == "Anna" and after.attrs["offset"].tolist() == [0, 1, 2]
+    assert intact_episodes(folder / "shard-00000.h5")[1] == [True, True]
+    np.testing.assert_array_equal(after.episode(1)["rgb"], episodes[1]["rgb"])
+
+
 def test_how_episodes_ended_is_kept_and_is_no_part_of_the_content(folder, episodes):
     before = RGBDDataset(folder)
     assert before.episode_terminated.tolist() == [False] * 3  # without the table none did
@@ -262,7 +304,7 @@ def test_how_episodes_ended_is_kept_and_is_no_part_of_the_content(folder, episod
     with h5py.File(folder / "shard-00000.h5", "a") as file:
         del file["ep_terminated"]
         file["ep_terminated"] = np.zeros(3, np.uint8)
-    with pytest.raises(DamagedShard, match=r"ep_terminated is \(3,\), for 2 episodes"):
+    with pytest.raises(DamagedShard, match=r"ep_terminated is uint8 \(3,\), for 2 episodes"):
         RGBDDataset(folder)
 
 
@@ -274,11 +316,19 @@ def test_writer_refuses_what_the_schema_does_not_have(tmp_path, episodes):
         lambda columns: columns.update(depth=columns["depth"].astype(np.float32)),
         lambda columns: columns.update(reward=columns["reward"][:-1]),
         lambda columns: columns.update(reward=columns["reward"] * np.nan),
+        lambda columns: columns.update({name: values[:0] for name, values in columns.items()}),
     ):
         columns = dict(episodes[0])
         spoil(columns)
         with pytest.raises(ValueError):
             write_shard(path, [columns], ATTRS, [0])
+    for chosen, numbers, ended, words in (
+        ([], [], (), "no episodes for shard-00000.h5"),
+        (episodes, [0, 1], (), "ep_index has 2 for 3 episodes; give one for each"),
+        (episodes, [0, 1, 2], [True], "ep_terminated has 1 for 3 episodes"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            write_shard(path, chosen, ATTRS, numbers, ended)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -129,6 +129,58 @@ def test_intact_episodes_of_a_damaged_shard_are_kept(tmp_path):
     np.testing.assert_array_equal(episode_hash(dataset.episode(0)), episode_hash(episodes[1]))
 
 
+@pytest.fixture
+def half_damaged(tmp_path):
+    """A shard whose first episode is damaged, with what somebody has added to it."""
+    rng = np.random.default_rng(0)
+    path = tmp_path / "shard-00000.h5"
+    write_shard(path, [make_episode(rng, 1000), make_episode(rng, 1000)], ATTRS, [4, 5])
+    with h5py.File(path, "a") as file:
+        file["notes/of_mine"] = np.arange(2)
+        file["ep_language"] = ["push", "pull"]
+        file.attrs["offset"], file.attrs["operator"] = np.arange(3.0), "Anna"
+    flip_a_byte_of(path, "rgb")
+    return path
+
+
+def test_repair_of_a_shard_with_more_than_ours(half_damaged):
+    kept = half_damaged.read_bytes()
+    repair(half_damaged.parent)
+    dataset = RGBDDataset(half_damaged.parent)
+    assert dataset.episode_indices.tolist() == [5] and not find_damage(half_damaged.parent)
+    assert dataset.attrs["offset"].tolist() == [0, 1, 2] and dataset.attrs["operator"] == "Anna"
+    assert (half_damaged.parent / "damaged" / half_damaged.name).read_bytes() == kept
+    with h5py.File(half_damaged, "r") as file:
+        assert "notes" not in file and "ep_language" not in file
+
+
+@pytest.mark.parametrize("step", ["repair.write_shard", "repair._copy_aside", "files.os.replace"])
+def test_a_repair_that_fails_or_is_killed_loses_nothing(half_damaged, monkeypatch, step):
+    before = half_damaged.read_bytes()
+
+    def fail(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(f"data_collection.{step}", fail)
+        repair(half_damaged.parent)
+    assert half_damaged.read_bytes() == before and not list(half_damaged.parent.glob("*.tmp"))
+    repair(half_damaged.parent)
+    assert RGBDDataset(half_damaged.parent).episode_indices.tolist() == [5]
+
+
+def test_repair_without_hard_links_copies(half_damaged, monkeypatch):
+    before = half_damaged.read_bytes()
+
+    def refuse(*_):
+        raise OSError("no hard links here")
+
+    monkeypatch.setattr("os.link", refuse)
+    repair(half_damaged.parent)
+    assert (half_damaged.parent / "damaged" / half_damaged.name).read_bytes() == before
+    assert RGBDDataset(half_damaged.parent).episode_indices.tolist() == [5]
+
+
 def test_repair_leaves_a_shard_alone_that_another_program_has_open(folder):
     before = sorted(folder.iterdir())
     with h5py.File(folder / "shard-00001.h5", "r+"):
