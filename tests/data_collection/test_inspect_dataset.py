@@ -257,16 +257,17 @@ def test_goals_of_a_hand_are_counted_where_they_change():
         half = np.radians(degrees) / 2
         return [*HOME, np.cos(half), 0, 0, np.sin(half)]
 
-    rows = [(0, 60), (40, 60), (55, 60), (55, 100), (70, 100)]  # cube and goal, degrees: one reached, one not
+    rows = [(0, 60), (40, 60), (55, 60)]  # cube and goal, degrees: reached, and the next goal is given
+    rows += [(70, 100), (92, 100), (80, 20), (70, 20)]  # reached in two steps; the third goal is not
     rows += [(0, 30), (10, 30)]  # the next episode
     scene_obs = np.array([pose(cube) + pose(goal) for cube, goal in rows], np.float32)
     scene_obs[-1, 2] = 0.05  # dropped
-    found = goal_statistics(scene_obs, np.array([[0, 5], [5, 7]]))
+    found = goal_statistics(scene_obs, np.array([[0, 7], [7, 9]]))
     assert found == {
-        "given": 3,
-        "reached": 0.3333,
+        "given": 4,
+        "reached": 0.5,
         "median_steps_to_reach": 2.0,
-        "median_degrees_at_start": 45.0,
-        "median_degrees_at_end": 20.0,
+        "median_degrees_at_start": 52.5,  # 60, 45, 72, 30
+        "median_degrees_at_end": 14.0,  # 5, 8, 50, 20
         "episodes_dropped": 0.5,
     }
