@@ -13,8 +13,8 @@ from envs.dexhand.goals import distances, is_dropped, is_reached
 def goal_statistics(scene_obs: NDArray[Any], slices: NDArray[np.int64]) -> dict[str, Any]:
     """Goals given and reached, rotation errors where a goal is given and where it ends, and cubes dropped.
 
-    A goal ends where it is reached, where the cube is dropped, or with the episode. The row in which one is reached still
-    has it, though the next one is given there: that one starts with the cube of this row.
+    A goal ends where it is reached, where the cube is dropped, or with the episode. The row in which one is reached
+    still has it, though the next one is given there: that one starts with the cube of this row.
 
     Args:
         scene_obs: (N, 14), the pose of the cube, then of its goal.

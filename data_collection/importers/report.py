@@ -121,10 +121,11 @@ def read_finished(folder: Path, parts: Sequence[Part]) -> dict[int, Outcome]:
         if not isinstance(origin, dict) or len(shard.ep_index) != 1:
             raise DamagedShard(path, f"no attribute '{ORIGIN}': not imported")
         index = int(shard.ep_index[0])
-        if index < len(parts) and parts[index].name != origin["part"]:
+        there = parts[index].name if index < len(parts) else f"past its {len(parts)} episodes"
+        if there != origin["part"]:
             raise UsageError(
-                f"{path} holds {origin['part']}, but there it is {parts[index].name} in the source; import from the "
-                "same source, or into another folder"
+                f"{path} holds {origin['part']}, but there it is {there} in the source; import from the same source, "
+                "or into another folder"
             )
         finished[index] = Outcome(index, origin["part"], None, tuple(origin["notes"]), shard.rows)
     return finished

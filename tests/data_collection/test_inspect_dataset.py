@@ -19,7 +19,7 @@ from data_collection.goal_statistics import goal_statistics
 from data_collection.pictures import write_film
 from data_collection.repair import find_damage, repair
 from data_collection.schema import episode_hash
-from data_collection.statistics import BY_NUMBER, column_ranges, moved_shares, workspace_coverage
+from data_collection.statistics import BY_NUMBER, column_ranges, describe, moved_shares, workspace_coverage
 from data_collection.writer import write_shard
 from envs.dexhand.goals import HOME
 from envs.errors import UsageError
@@ -250,6 +250,17 @@ def test_workspace_coverage_of_known_positions():
     assert full["share_of_frames_inside"] == 1
     half = workspace_coverage(np.concatenate([centres[:250], centres[:250] + 9]), workspace)
     assert half["share_of_cells_visited"] == 0.25 and half["share_of_frames_inside"] == 0.5
+
+
+def test_anothers_dataset_is_described_without_what_is_only_known_of_ours(tmp_path):
+    episode = make_episode(np.random.default_rng(0), 4)
+    episode["scene_obs"] = np.zeros((4, 3), np.float32)
+    for number, env_id in enumerate(("lab/TabletopSort-v0", "lab/DexHandover-v0")):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        attrs = {**ATTRS, "env_id": env_id, "workspace": [0.3, 0.4]}
+        write_shard(folder / "shard-00000.h5", [episode], attrs, [0])
+        assert not {"workspace", "moved", "goals"} & describe(RGBDDataset(folder)).keys()
 
 
 def test_goals_of_a_hand_are_counted_where_they_change():
