@@ -11,12 +11,12 @@ from PIL import Image
 
 from data_collection.dataset import RGBDDataset
 from data_collection.environments import KNOWN_ENVS, known_env
-from data_collection.files import written_aside
 from data_collection.pictures import colour_depth
 from data_collection.schema import quantise_depth
 from envs.command import run
 from envs.dexhand import DexHandEnv
 from envs.errors import UsageError
+from envs.files import written_aside
 
 COLOURS = 256  # of the picture
 

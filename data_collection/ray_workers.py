@@ -22,11 +22,11 @@ import ray
 from ray.exceptions import ActorDiedError, ActorUnavailableError, RayError
 
 from data_collection.episodes import EpisodeMaker
-from data_collection.files import written_aside
 from data_collection.manifest import Manifest
 from data_collection.workers import ONE_THREAD, START_SECONDS, Worker, WorkerPool, log_failure
 from data_collection.writer import shard_path
 from envs.errors import UsageError
+from envs.files import written_aside
 
 POLL_S = 5.0
 

@@ -7,10 +7,10 @@ import shutil
 from pathlib import Path
 
 from data_collection.attributes import FROM_CAMERA
-from data_collection.files import locked, remove_leftovers, written_aside
 from data_collection.schema import SHARD_PATTERN, DamagedShard, Shard
 from data_collection.writer import intact_episodes, read_episode, write_shard
 from envs.errors import UsageError
+from envs.files import locked, remove_leftovers, written_aside
 
 DAMAGED_FOLDER = "damaged"
 

@@ -15,10 +15,10 @@ import numpy as np
 from tqdm import tqdm
 
 from data_collection.environments import KNOWN_ENVS, known_env, resolve_env
-from data_collection.files import write_json, written_aside
 from data_collection.policies.stable_baselines import SUFFIX, load_model
 from envs.command import run
 from envs.errors import UsageError
+from envs.files import write_json, written_aside
 
 DISCOUNT, POLYAK, GOALS_A_STEP = 0.98, 0.05, 4  # Plappert et al. (2018), but for the discount of a shorter episode
 LEARNING_STARTS = 1000  # steps before the first update

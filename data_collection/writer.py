@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_collection.attributes import complete_attributes
-from data_collection.files import written_aside
 from data_collection.schema import (
     COLUMNS,
     DamagedShard,
@@ -27,6 +26,7 @@ from data_collection.schema import (
     unreadable,
 )
 from envs.errors import UsageError
+from envs.files import written_aside
 
 CHUNK_BYTES = 1 << 19  # a chunk is a run of frames of one clip; half a megabyte stays in the cache while it is unpacked
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from data_collection.files import write_json
 from data_collection.importers.crew import ORIGIN, Outcome
 from data_collection.importers.source import Part
 from data_collection.schema import SHARD_PATTERN, DamagedShard, read_shard
 from envs.errors import UsageError
+from envs.files import write_json
 
 REPORT_NAME = "import.json"
 LINES_SHOWN = 20

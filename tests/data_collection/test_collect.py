@@ -16,12 +16,12 @@ from data_collection.collect import Config, main
 from data_collection.dataset import RGBDDataset
 from data_collection.environments import versions
 from data_collection.episodes import EpisodeMaker
-from data_collection.files import locked
 from data_collection.manifest import Manifest
 from data_collection.policies.random import RandomPolicy
 from data_collection.repair import find_damage
 from data_collection.rollout import collect_episode
 from envs.errors import UsageError
+from envs.files import locked
 
 
 def test_episodes_are_as_the_environment_gave_them(collected):

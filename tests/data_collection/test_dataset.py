@@ -336,7 +336,7 @@ def test_shard_is_replaced_or_left(folder, episodes, monkeypatch):
     """A writer that fails half-way leaves the shard that was there, and no other file."""
     path = folder / "shard-00001.h5"
     before = path.read_bytes()
-    monkeypatch.setattr("data_collection.files.os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    monkeypatch.setattr("envs.files.os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
         write_shard(path, episodes, ATTRS, [0, 1, 2])
     assert path.read_bytes() == before and not list(folder.glob("*.tmp"))

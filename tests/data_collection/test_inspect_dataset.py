@@ -14,7 +14,6 @@ from layouts import write_omnipush
 from shards import ATTRS, flip_a_byte_of, make_episode
 
 from data_collection.dataset import RGBDDataset
-from data_collection.files import locked
 from data_collection.goal_statistics import goal_statistics
 from data_collection.pictures import write_film
 from data_collection.repair import find_damage, repair
@@ -23,6 +22,7 @@ from data_collection.statistics import BY_NUMBER, column_ranges, describe, moved
 from data_collection.writer import write_shard
 from envs.dexhand.goals import HOME
 from envs.errors import UsageError
+from envs.files import locked
 
 
 @pytest.fixture
@@ -154,7 +154,9 @@ def test_repair_of_a_shard_with_more_than_ours(half_damaged):
         assert "notes" not in file and "ep_language" not in file
 
 
-@pytest.mark.parametrize("step", ["repair.write_shard", "repair._copy_aside", "files.os.replace"])
+@pytest.mark.parametrize(
+    "step", ["data_collection.repair.write_shard", "data_collection.repair._copy_aside", "envs.files.os.replace"]
+)
 def test_a_repair_that_fails_or_is_killed_loses_nothing(half_damaged, monkeypatch, step):
     before = half_damaged.read_bytes()
 
@@ -162,7 +164,7 @@ def test_a_repair_that_fails_or_is_killed_loses_nothing(half_damaged, monkeypatc
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(f"data_collection.{step}", fail)
+        patch.setattr(step, fail)
         repair(half_damaged.parent)
     assert half_damaged.read_bytes() == before and not list(half_damaged.parent.glob("*.tmp"))
     repair(half_damaged.parent)
