@@ -19,7 +19,19 @@ from envs.base import RGBDEnv
 from envs.errors import UsageError
 from envs.gl import gl_renderer
 
-PACKAGES = ("t3vip", "mujoco", "robosuite", "gymnasium", "numpy", "h5py")
+PACKAGES = (
+    "t3vip",
+    "mujoco",
+    "robosuite",
+    "gymnasium",
+    "gymnasium-robotics",
+    "dm_control",
+    "fast-simplification",
+    "numpy",
+    "scipy",
+    "h5py",
+)
+"""Distributions that an episode depends on: physics, scenes and meshes, arithmetic, and the file."""
 
 
 @dataclass(frozen=True)

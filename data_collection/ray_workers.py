@@ -158,7 +158,7 @@ class RayWorker(Worker):
             return "failed", _describe_death(error)
         if answer.kind == "placed":
             self.place = answer.detail
-            self.be_patient(START_SECONDS)
+            self.be_patient(START_SECONDS, "it was not ready")
             return None
         if answer.kind == "ready":
             self.be_patient(self._timeout)

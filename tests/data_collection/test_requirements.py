@@ -7,7 +7,7 @@ from commands import assert_one_line_error, call, options
 from standin import StandIn
 
 from data_collection import environments, train_policy
-from data_collection.environments import KNOWN_ENVS, describe_env, known_env, make_env
+from data_collection.environments import KNOWN_ENVS, describe_env, known_env, make_env, versions
 from data_collection.policies.random import RandomPolicy
 from data_collection.rollout import collect_episode
 from envs.errors import UsageError
@@ -70,6 +70,11 @@ def test_what_a_dataset_does_not_store_is_refused_before_an_episode(odd, words):
 )
 def test_an_environment_is_ours_only_by_its_whole_id(name, ours):
     assert known_env(name) is (KNOWN_ENVS[ours] if ours else None)
+
+
+def test_the_versions_of_all_that_makes_scenes_are_told():
+    told = versions()
+    assert all(told.values()) and {"gymnasium-robotics", "dm_control", "scipy", "fast-simplification"} <= set(told)
 
 
 def test_what_draws_anothers_pictures_is_what_it_says(monkeypatch):
