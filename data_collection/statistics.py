@@ -50,7 +50,7 @@ def describe(dataset: RGBDDataset) -> dict[str, Any]:
         "columns": column_ranges(dataset),
     }
     proprio, env = dataset.load("proprio"), known_env(str(dataset.attrs["env_id"]))
-    if np.shape(dataset.attrs.get("workspace")) == WORKSPACE and proprio.shape[1] >= 3:
+    if np.shape(dataset.attrs.get("workspace", ())) == WORKSPACE and proprio.shape[1] >= 3:
         report["workspace"] = workspace_coverage(proprio[:, :3], np.asarray(dataset.attrs["workspace"]))
     if "scene_obs" in dataset.columns and env is KNOWN_ENVS["tabletop"]:
         report["moved"] = moved_shares(dataset.load("scene_obs"), dataset.episode_slices)

@@ -61,9 +61,9 @@ def write_shard(
     if not episodes:
         raise UsageError(f"no episodes for {path.name}; give one or more, and write no shard where there are none")
     ended = list(ep_terminated) or [False] * len(episodes)
-    for name, table in (("ep_index", ep_index), ("ep_terminated", ended)):
-        if len(table) != len(episodes):
-            raise UsageError(f"{name} has {len(table)} for {len(episodes)} episodes; give one for each")
+    for name, given in (("ep_index", ep_index), ("ep_terminated", ended)):
+        if len(given) != len(episodes):
+            raise UsageError(f"{name} has {len(given)} for {len(episodes)} episodes; give one for each")
     for columns in episodes:
         _check(columns, episodes[0])
     complete = complete_attributes(attrs, {name: values.shape[1:] for name, values in episodes[0].items()})

@@ -59,8 +59,8 @@ class CalvinSource:
     depth_scale: float
     notes: tuple[str, ...]
 
-    # `rel_actions` are how far the hand went to the next frame, in position and Euler angles, over the units and clipped
-    # to -1 and 1. Number by number, such differences add up to those over several frames, except where they are clipped.
+    # `rel_actions` say how far the hand went to the next frame, in position and Euler angles, in units and clipped to
+    # -1 and 1. Number by number, such differences add up to those over several frames, but where they are clipped.
     action_aggregation = ("sum",) * 6 + ("last",)
     action_scale = (UNIT_M, UNIT_M, UNIT_M, UNIT_RAD, UNIT_RAD, UNIT_RAD, 1.0)
 
