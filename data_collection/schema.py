@@ -37,6 +37,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.depth import clipped_depth
 from envs.errors import UsageError
 
 SCHEMA_VERSION = 1
@@ -122,15 +123,10 @@ def quantise_depth(metres: NDArray[Any], near: float, far: float) -> NDArray[np.
     """Depth in metres, any shape -> uint16 over [near, far], clipped to it.
 
     Raises:
-        UsageError: it has NaN, which cast to a whole number would be a surface at the near plane.
+        UsageError: it is no depth in metres, or has holes; see `clipped_depth`.
     """
-    holes = np.count_nonzero(np.isnan(metres))
-    if holes:
-        raise UsageError(
-            f"depth has NaN in {holes} of {np.size(metres)} pixels; fill such holes first, as with what is around them"
-        )
-    unit = (np.asarray(metres, np.float64) - near) / (far - near)
-    return np.rint(np.clip(unit, 0.0, 1.0) * DEPTH_STEPS).astype(np.uint16)
+    unit = (clipped_depth(metres, near, far) - near) / (far - near)
+    return np.rint(unit * DEPTH_STEPS).astype(np.uint16)
 
 
 def dequantise_depth(raw: NDArray[np.uint16], near: float, far: float) -> NDArray[np.float32]:

@@ -79,6 +79,19 @@ def test_depth_with_holes_is_refused_and_what_is_too_near_or_far_is_clipped():
     assert clipped.tolist() == [0, 0, DEPTH_STEPS, DEPTH_STEPS]
 
 
+@pytest.mark.parametrize(
+    ("depth", "near", "far", "words"),
+    [
+        (np.array([1200, 1300], np.uint16), 0.5, 3.0, "depth is uint16; give metres as floats"),
+        (np.array([1200.0, 1300.0]), 0.5, 3.0, "most of the depth is about 1250, but the camera's range ends at 3 m"),
+        (np.array([1.2, 1.3]), 3.0, 0.5, "depth range is near=3.0, far=0.5"),
+    ],
+)
+def test_depth_that_is_not_in_metres_is_refused(depth, near, far, words):
+    with pytest.raises(UsageError, match=words):
+        quantise_depth(depth, near, far)
+
+
 def test_a_dataset_is_a_sequence_of_episodes(folder):
     dataset = RGBDDataset(folder)
     for number, episode in enumerate(dataset):
