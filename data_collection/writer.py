@@ -29,6 +29,7 @@ from envs.errors import UsageError
 from envs.files import written_aside
 
 CHUNK_BYTES = 1 << 19  # a chunk is a run of frames of one clip; half a megabyte stays in the cache while it is unpacked
+ACTED = ("action", "reward", "joint_delta")  # columns of what is done, or comes of it, between frames
 
 
 def shard_path(folder: Path, episode: int) -> Path:
@@ -54,9 +55,8 @@ def write_shard(
         ep_terminated: whether each episode ended in a terminal state; none did if not given.
 
     Raises:
-        ValueError: a column is not what the schema says.
-        UsageError: there are no episodes, a table is not as long as they are many, or an attribute is missing or does
-            not fit the columns.
+        UsageError: there are no episodes, a column is not what the schema says, a table is not as long as they are
+            many, or an attribute is missing or does not fit the columns.
     """
     if not episodes:
         raise UsageError(f"no episodes for {path.name}; give one or more, and write no shard where there are none")
@@ -125,20 +125,21 @@ def _chunk(values: NDArray[Any]) -> tuple[int, ...]:
 def _check(columns: Mapping[str, NDArray[Any]], first: Mapping[str, NDArray[Any]]) -> None:
     missing = [name for name, column in COLUMNS.items() if column.required and name not in columns]
     if missing:
-        raise ValueError(f"an episode without column '{missing[0]}'")
+        raise UsageError(f"an episode without column '{missing[0]}'")
     if columns.keys() != first.keys():
-        raise ValueError(f"episodes of one shard with different columns: {sorted(columns)} and {sorted(first)}")
-    rows = len(columns["action"])
+        raise UsageError(f"episodes of one shard with different columns: {sorted(columns)} and {sorted(first)}")
+    rows = len(columns["rgb"])
     if not rows:
-        raise ValueError("an episode without rows; one of T actions has T + 1")
+        raise UsageError("an episode without rows; one of T actions has T + 1")
     for name, values in columns.items():
         expected = COLUMNS.get(name)
         if expected is None:
-            raise ValueError(f"unknown column '{name}'; the schema has {', '.join(COLUMNS)}")
+            raise UsageError(f"unknown column '{name}'; the schema has {', '.join(COLUMNS)}")
         if str(values.dtype) != expected.dtype or values.ndim != expected.ndim or len(values) != rows:
-            raise ValueError(
+            short = name in ACTED and len(values) == rows - 1
+            raise UsageError(
                 f"column '{name}' is {values.dtype} {values.shape}, not {rows} rows of {expected.dtype} "
-                f"with {expected.ndim} axes"
+                f"with {expected.ndim} axes" + ("; the last frame has a row of zeros, too" if short else "")
             )
         if values.dtype.kind == "f" and not np.isfinite(values).all():
-            raise ValueError(f"column '{name}' has values that are not finite")
+            raise UsageError(f"column '{name}' has values that are not finite")

@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import re
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,21 +16,22 @@ from typing import Any
 from envs.errors import UsageError
 
 LOCK_NAME = ".lock"
-ASIDE = re.compile(r".+\.\d+\.tmp")  # what `written_aside` calls a file, with the number of its process
+ASIDE = re.compile(r".+\.\d+\.tmp")  # what `written_aside` calls a file, with the number of its thread
 
 
 @contextlib.contextmanager
 def written_aside(path: Path) -> Iterator[Path]:
     """Give the path of a temporary file that takes the place of `path` when the block ends well.
 
-    The temporary name, NAME.<pid>.tmp, carries the process id, so that two processes never write into the same file. An
-    exception in the block removes it; what a killed process leaves, `remove_leftovers` clears. What is no file, such as
-    /dev/stdout, has no other to take its place: it is written to itself.
+    The temporary name, NAME.<id>.tmp, carries the number that the system gives the thread, which in a program of one
+    is that of the process: no two writers share a file. An exception in the block removes it; what a killed process
+    leaves, `remove_leftovers` clears. What is no file, such as /dev/stdout, has no other to take its place: it is
+    written to itself.
     """
     if path.exists() and not (path.is_file() or path.is_dir()):
         yield path
         return
-    aside = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    aside = path.with_name(f"{path.name}.{threading.get_native_id()}.tmp")
     try:
         yield aside
         _sync(aside)

@@ -289,6 +289,12 @@ def test_how_episodes_ended_is_kept_and_is_no_part_of_the_content(folder, episod
         RGBDDataset(folder)
 
 
+def test_actions_between_the_frames_only_are_told_of_the_last_row(tmp_path, episodes):
+    short = {**episodes[0], "action": episodes[0]["action"][:-1]}
+    with pytest.raises(UsageError, match=r"column 'action' is float32 .*; the last frame has a row of zeros, too"):
+        write_shard(tmp_path / "shard-00000.h5", [short], ATTRS, [0])
+
+
 def test_writer_refuses_what_the_schema_does_not_have(tmp_path, episodes):
     path = tmp_path / "shard-00000.h5"
     for spoil in (

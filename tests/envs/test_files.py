@@ -1,6 +1,7 @@
 """Files are whole or not there."""
 
 import os
+from concurrent.futures import ThreadPoolExecutor
 
 import imageio.v3 as iio
 import pytest
@@ -16,6 +17,19 @@ def test_what_is_no_file_is_not_replaced(tmp_path):
     with written_aside(tmp_path / "pipe") as aside:
         assert aside == tmp_path / "pipe"
     assert [path.name for path in tmp_path.iterdir()] == ["pipe"] and (tmp_path / "pipe").is_fifo()
+
+
+def test_threads_do_not_share_a_temporary_file(tmp_path):
+    with written_aside(tmp_path / "x") as mine, ThreadPoolExecutor(1) as others:
+
+        def write() -> None:
+            with written_aside(tmp_path / "x") as theirs:
+                assert theirs != mine
+                theirs.write_text("theirs")
+
+        others.submit(write).result()
+        mine.write_text("mine")
+    assert [path.name for path in tmp_path.iterdir()] == ["x"] and (tmp_path / "x").read_text() == "mine"
 
 
 def check(folder):
