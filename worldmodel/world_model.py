@@ -142,6 +142,11 @@ class WorldModel(nn.Module, ABC):
             raise UsageError(
                 f"rgb is {tuple(rgb.shape)} and depth {tuple(depth.shape)}; give (B, T, 3, H, W) and (B, T, 1, H, W)"
             )
+        if actions is not None and actions.shape[:2] != (batch, frames - 1):
+            raise UsageError(
+                f"actions are {tuple(actions.shape)} for {frames} frames; give ({batch}, {frames - 1}, A), "
+                "one for each gap between frames: aggregate_actions makes it of the actions of its control steps"
+            )
         memory = self.blank_memory(rgb[:, 0])
         for t in range(rgb.shape[1] - 1):
             action = None if actions is None else actions[:, t]
