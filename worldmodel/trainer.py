@@ -7,6 +7,7 @@ import math
 import signal
 import time
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 from typing import Any
 
 import numpy as np
@@ -98,15 +99,17 @@ class Trainer:
             self._check_data(state.get("data"))
         self.ranks.begin_alike(self.parameters, self.step)
         first = self.ranks.first
-        journal = Journal(options.out, self.step) if first else None
         started = time.monotonic()
         base_seconds = self.seconds
         waited = 0.0
         terms: dict[str, float] = {}
-        bar = tqdm(
-            total=options.steps, initial=self.step, desc="train", unit="step", dynamic_ncols=True, disable=not first
-        )
-        with stop_signals() as stops:
+        with ExitStack() as opened:  # however it ends, what the journal still holds is written
+            journal = opened.enter_context(closing(Journal(options.out, self.step))) if first else None
+            bar = tqdm(
+                total=options.steps, initial=self.step, desc="train", unit="step", dynamic_ncols=True, disable=not first
+            )
+            opened.enter_context(bar)
+            stops = opened.enter_context(stop_signals())
             while self.step < options.steps:
                 self.model.train()
                 asked = time.monotonic()
@@ -132,9 +135,6 @@ class Trainer:
                     if journal:
                         bar.write(f"stopped at step {self.step}; the same command goes on from here")
                     break
-        bar.close()
-        if journal:
-            journal.close()
         if signal.SIGINT in stops:
             raise KeyboardInterrupt
         if self.step < options.steps:

@@ -1,5 +1,6 @@
 """Training learns, goes on exactly where it stopped, and survives frames that are no numbers."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from data_collection.dataset import RGBDDataset
 from envs.errors import UsageError
 from worldmodel.clips import Clips, ClipSource
+from worldmodel.journal import Journal
 from worldmodel.metrics import flow_scores
 from worldmodel.options import PRESETS, Schedule
 from worldmodel.rollout import unroll
@@ -45,9 +48,12 @@ def test_a_run_that_was_stopped_ends_with_the_same_bits(make_trainer, precision,
             raise KeyboardInterrupt
         return update(self, clips)
 
+    closed, close = [], Journal.close
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(Trainer, "update", interrupted)
+        patch.setattr(Journal, "close", lambda self: (closed.append(self), close(self)))
         stopped.run()
+    assert len(closed) == 1
     torch.manual_seed(123)  # nothing may hang on the state of the global generator
     resumed = make_trainer("stopped", seed=0, **options)
     resumed.run()
@@ -58,6 +64,20 @@ def test_a_run_that_was_stopped_ends_with_the_same_bits(make_trainer, precision,
     assert resumed.step == 6 and resumed.best == straight.best
     before = checkpoint(straight.options.out, 3)
     assert not torch.equal(before["model.transforms.last.weight"], ours["model.transforms.last.weight"])
+
+
+def test_a_run_that_goes_on_keeps_all_that_was_told_up_to_there(tmp_path):
+    for start, steps in ((0, (1, 2, 3, 4)), (3, (4, 5))):  # the first was killed after its checkpoint of step 3
+        journal = Journal(tmp_path, start)
+        for step in steps:
+            journal.write("validation", step, {"score": 10.0 * start + step})
+        journal.close()
+    expected = [(1, 1.0), (2, 2.0), (3, 3.0), (4, 34.0), (5, 35.0)]
+    lines = [json.loads(line) for line in journal.path.read_text().splitlines()]
+    assert [(line["step"], line["score"]) for line in lines] == expected
+    board = EventAccumulator(str(tmp_path / "tensorboard"))
+    board.Reload()
+    assert [(event.step, event.value) for event in board.Scalars("validation/score")] == expected
 
 
 def test_it_learns_a_clip_by_heart_and_how_the_square_moves(make_trainer, tiny_dataset):
