@@ -250,11 +250,11 @@ class Trainer:
         scores = validate(self.model, self.validation)
         journal.write("validation", self.step, scores)
         clips, starts = next(self.validation.batches())
-        truth = None
-        if self.validation.source.dataset.has_ground_truth:
-            truth = self.validation.source.truth_at(starts[:1], self.validation.frames)
+        source, truth = self.validation.source, None
+        if source.dataset.has_ground_truth:
+            truth = source.truth_at(starts[:1], self.validation.frames)
         picture = self.options.out / "pictures" / f"step-{self.step:08d}.png"
-        picture_prediction(self.model, clips, truth, self.options.context, picture)
+        picture_prediction(self.model, clips, truth, self.options.context, source.frame_seconds, picture)
         score = float(scores["score"])  # type: ignore[arg-type]
         if score >= self.best:
             self.best = score

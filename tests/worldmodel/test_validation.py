@@ -109,7 +109,7 @@ def test_a_picture_shows_each_predicted_frame(make_model, source, validation, tm
 
     clips, starts = next(validation.batches())
     truth = source.truth_at(starts[:1], validation.frames)
-    picture_prediction(make_model(), clips, truth, 2, tmp_path / "new" / "a.png", scale=1)
+    picture_prediction(make_model(), clips, truth, 2, source.frame_seconds, tmp_path / "new" / "a.png", scale=1)
     sheet = imageio.imread(tmp_path / "new" / "a.png")
     windows = np.lib.stride_tricks.sliding_window_view(sheet, (16, 24, 3))[:, :, 0]
     for frame in clips.rgb[0, 1:]:
