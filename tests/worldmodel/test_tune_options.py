@@ -134,6 +134,24 @@ def test_a_search_may_be_given_more_trials_where_they_hang_on_their_number_alone
     assert_one_line(tune_with("--trials", 4, "--searcher", "bohb"), "trials = 3, not 4", "another --out")
 
 
+def test_a_search_that_was_moved_goes_on_where_it_is(tune_with, monkeypatch, tmp_path):
+    """Ray's state holds the old place."""
+    assert tune_with()[0] == 130
+    (tune_with.out / "ray").mkdir()
+    (tmp_path / "link").symlink_to(tune_with.out)
+    assert tune_with(out=tmp_path / "link")[0] == 130 and (tune_with.out / "ray").exists()
+    moved = tune_with.out.rename(tmp_path / "moved")
+    assert tune_with(out=moved)[0] == 130 and not (moved / "ray").exists()
+    settings = json.loads((moved / "tune.json").read_text())
+    assert settings["out"] == str(moved)
+    monkeypatch.setattr(searchers, "check_searcher", lambda name: None)
+    settings["options"]["searcher"] = "bohb"
+    (moved / "tune.json").write_text(json.dumps(settings | {"out": "/before"}))
+    (moved / "ray").mkdir()
+    assert_one_line(tune_with("--searcher", "bohb", out=moved), "was begun in /before, where bohb", "another --out")
+    assert (moved / "ray").exists()
+
+
 def test_a_dataset_may_go_by_several_names(tune_with, write_dataset, monkeypatch, tmp_path):
     data, held_out = (write_dataset(tmp_path / name, [16, 16, 16], seed=seed) for seed, name in enumerate("dv"))
     assert tune_with("--validation", held_out, data=data)[0] == 130
