@@ -56,12 +56,10 @@ class WorldState:
     """What a model knows: the current frame, seen or predicted, and its memory."""
 
     rgb: Tensor
+    """(B, 3, H, W) in [0, 1], float32."""
     depth: Tensor
+    """(B, 1, H, W) metres, float32; of a model that knows pictures only, that of the last frame seen."""
     memory: Memory
-
-    def expand(self, count: int) -> WorldState:
-        """The same state `count` times over, for that many candidate futures; the batch must be 1."""
-        return WorldState(expand(self.rgb, count), expand(self.depth, count), self.memory.expand(count))
 
 
 class WorldModel(nn.Module, ABC):
@@ -168,11 +166,14 @@ class WorldModel(nn.Module, ABC):
             action: (B, A) in the dataset's units; None is for action-free models.
             latent: (B, Z, H/8, W/8), zeros when None.
             paint, picture: see `predict`.
+
+        Returns:
+            The state at the next frame, of a batch of B, and what was predicted of it.
         """
         prediction, memory = self.predict(
             state.rgb, state.depth, action, latent, state.memory, paint=paint, picture=picture
         )
-        depth = state.depth if prediction.depth is None else prediction.depth
+        depth = expand(state.depth, len(prediction.rgb)) if prediction.depth is None else prediction.depth
         return WorldState(prediction.rgb, depth, memory), prediction
 
     def predict(
