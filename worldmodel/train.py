@@ -17,7 +17,7 @@ from envs.errors import UsageError
 from worldmodel.budget import Cost, measure_cost
 from worldmodel.clips import ClipSource
 from worldmodel.config_file import changed, read_config
-from worldmodel.devices import find_device, find_precision, prepare_devices
+from worldmodel.devices import describe, find_device, find_precision, prepare_devices
 from worldmodel.memory import keep_freed_memory
 from worldmodel.models import make_model, named_config
 from worldmodel.options import PRESETS, TrainOptions
@@ -72,6 +72,7 @@ def make_trainer(options: TrainOptions, train: ClipSource, validation: Validatio
         "options": document_of(options),
         "data": {"train": train.dataset.content_hash, "validation": validation.source.dataset.content_hash},
         "versions": {"torch": torch.__version__},
+        "machine": describe(ranks.device),
     }
     return Trainer(model, options, train, validation, origin, ranks)
 
