@@ -10,6 +10,8 @@ MOVING_M = 0.005
 """A pixel whose point truly moves farther than this from frame to frame is moving."""
 STILL_M = 0.0005
 """One whose point moves less than this is still."""
+SSIM_SIGMA = 1.5
+"""Of the Gaussian window of SSIM, 11 pixels wide, in pixels."""
 
 
 def psnr_per_step(predicted: Tensor, target: Tensor) -> Tensor:
@@ -33,18 +35,17 @@ def relative_depth_error(predicted: Tensor, target: Tensor) -> Tensor:
     return ((predicted - target).abs() / target.clamp(min=1e-6)).mean((-3, -2, -1))
 
 
-def ssim(predicted: Tensor, target: Tensor, sigma: float = 1.5) -> Tensor:
+def ssim(predicted: Tensor, target: Tensor) -> Tensor:
     """Structural similarity (Wang et al. 2004) of pictures in [0, 1], each channel by itself, edges reflected.
 
     Args:
         predicted, target: (N, C, H, W), sides of more than 5 pixels.
-        sigma: of the Gaussian window, 11 pixels wide, in pixels.
 
     Returns:
         (N,), the mean over channels and pixels; 1 for equal pictures.
     """
-    radius = int(3.5 * sigma + 0.5)
-    window = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, device=predicted.device) / sigma).square())
+    radius = 5
+    window = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, device=predicted.device) / SSIM_SIGMA).square())
     window = window / window.sum()
 
     def blur(x: Tensor) -> Tensor:
