@@ -15,7 +15,7 @@ from worldmodel.clips import Clips, ClipSource
 from worldmodel.metrics import flow_scores, psnr_per_step, rmse_per_step
 from worldmodel.rollout import Rollout, unroll
 from worldmodel.t3vip import T3VIP, CloudPrediction
-from worldmodel.tracking import HandTrack
+from worldmodel.tracking import tcp_way
 from worldmodel.world_model import WorldModel
 
 Scores = dict[str, float | list[float]]
@@ -123,13 +123,11 @@ def validate(model: WorldModel, data: ValidationSet, still: bool = False) -> Sco
 def track_tcp(model: T3VIP, clips: Clips, tcp: Tensor, free: Rollout, context: int) -> tuple[Tensor, Tensor]:
     """How far the TCP, moved by predicted transforms, is off at the clip's end, and how far it went, (B,) metres."""
     points = clips.depth[:, context - 1] * model.rays
+    clouds = [p for p in free.predictions[context - 1 :] if isinstance(p, CloudPrediction)]
     ends = []
     for b in range(len(points)):
-        track = HandTrack.start(points[b], tcp[b, context - 1].to(points), model.intrinsics, 1)
-        for prediction in free.predictions[context - 1 :]:
-            assert isinstance(prediction, CloudPrediction)
-            track = track.advance(prediction.transform[b : b + 1], prediction.masks[b : b + 1, :1])
-        ends.append(track.tcp[0].cpu())
+        steps = ((cloud.transform[b : b + 1], cloud.masks[b : b + 1, :1]) for cloud in clouds)
+        ends.append(tcp_way(points[b], tcp[b, context - 1].to(points), model.intrinsics, steps)[-1].cpu())
     error = (torch.stack(ends) - tcp[:, -1]).norm(dim=1)
     return error, (tcp[:, -1] - tcp[:, context - 1]).norm(dim=1)
 
