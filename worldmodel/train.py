@@ -18,13 +18,13 @@ from worldmodel.budget import Cost, measure_cost
 from worldmodel.clips import ClipSource
 from worldmodel.config_file import changed, read_config
 from worldmodel.devices import describe, find_device, find_precision, prepare_devices
+from worldmodel.held_out import ValidationSet
 from worldmodel.memory import keep_freed_memory
 from worldmodel.models import make_model, named_config
 from worldmodel.options import PRESETS, TrainOptions
 from worldmodel.ranks import Ranks, join_ranks
 from worldmodel.trainer import Trainer
 from worldmodel.training_data import model_context, open_data, settled
-from worldmodel.validation import ValidationSet
 
 HOW_NOT_WHAT = ("device", "deterministic", "cuda_graphs", "memory_limit", "save_every", "log_every")
 """Options that a run may go on with others of."""

@@ -21,6 +21,7 @@ from worldmodel.checkpoint import load_training, save_model, save_training
 from worldmodel.clips import Clips, ClipSource
 from worldmodel.colour_jitter import ColourJitter
 from worldmodel.devices import find_precision
+from worldmodel.held_out import ValidationSet
 from worldmodel.inference import InferenceNetwork, inference_network
 from worldmodel.journal import Journal, finite
 from worldmodel.objective import StepInputs, objective
@@ -29,7 +30,7 @@ from worldmodel.pictures import picture_prediction
 from worldmodel.ranks import ALONE, Ranks
 from worldmodel.recording import Recorder
 from worldmodel.stopping import stop_signals
-from worldmodel.validation import Scores, ValidationSet, summary, validate
+from worldmodel.validation import Scores, summary, validate
 from worldmodel.world_model import WorldModel
 
 logger = logging.getLogger(__name__)

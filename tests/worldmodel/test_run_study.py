@@ -20,13 +20,13 @@ from worldmodel.budget import Cost
 from worldmodel.checkpoint import load_model
 from worldmodel.clips import ClipSource
 from worldmodel.evaluate import EvaluationOptions
+from worldmodel.held_out import ValidationSet
 from worldmodel.perceptual_weights import WeightsUnavailable
 from worldmodel.rollout import unroll
 from worldmodel.study import paper, plan, report, training
 from worldmodel.study.findings import findings
 from worldmodel.study.options import StudyOptions
 from worldmodel.train import parse_options
-from worldmodel.validation import ValidationSet
 
 TINY = ["--preset", "tiny", "--samples", 0, "--clips", 4, "--no-vgg", "--device", "cpu"]
 HORIZONS = ["--horizons", 2, 3]

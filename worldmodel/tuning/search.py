@@ -12,12 +12,12 @@ from data_collection.files import write_json
 from data_collection.ray_cluster import connect
 from envs.errors import UsageError
 from worldmodel.clips import ClipSource
+from worldmodel.held_out import ValidationSet
 from worldmodel.train import HOW_NOT_WHAT, changes, document_of
 from worldmodel.training_data import open_data, settled
 from worldmodel.tuning import journal
 from worldmodel.tuning.options import TuneOptions
 from worldmodel.tuning.space import axes_of, point_of
-from worldmodel.validation import ValidationSet
 
 SETTINGS, RAY = "tune.json", "ray"
 QUIET = {
