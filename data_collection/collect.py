@@ -18,7 +18,6 @@ from data_collection.environments import (
     usual_steps,
     versions,
 )
-from data_collection.files import LOCK_NAME, locked, remove_leftovers
 from data_collection.manifest import MANIFEST_NAME, Manifest, read_manifest
 from data_collection.policies import POLICIES
 from data_collection.policies.stable_baselines import SUFFIX, policy_name
@@ -29,6 +28,7 @@ from data_collection.workers import ERROR_LOG, Collected, WorkerLost, collect_ep
 from data_collection.writer import shard_path
 from envs.command import end_on_sigterm, run
 from envs.errors import UsageError
+from envs.files import LOCK_NAME, locked, remove_leftovers
 
 IMAGE_SIZE = 64  # pixels
 

@@ -73,9 +73,10 @@ class RGBDDataset:
                     f"use a dataset that has it, as collect-rollouts writes"
                     + (" with --ground-truth" if name in GROUND_TRUTH else "")
                 )
-            if shard.columns[name] != first.columns[name]:
+        for name, row in shard.columns.items():
+            if row != first.columns.get(name, row):
                 raise UsageError(
-                    f"column '{name}' has rows of {shard.columns[name]} in {shard.path} but {first.columns[name]} in "
+                    f"column '{name}' has rows of {row} in {shard.path} but {first.columns[name]} in "
                     f"{first.path.name}; keep one dataset in a folder"
                 )
         for name in MEANING:

@@ -15,10 +15,23 @@ import numpy as np
 import data_collection
 import envs  # registers the environments
 from data_collection.requirements import check_env
+from envs.base import RGBDEnv
 from envs.errors import UsageError
 from envs.gl import gl_renderer
 
-PACKAGES = ("t3vip", "mujoco", "robosuite", "gymnasium", "numpy", "h5py")
+PACKAGES = (
+    "t3vip",
+    "mujoco",
+    "robosuite",
+    "gymnasium",
+    "gymnasium-robotics",
+    "dm_control",
+    "fast-simplification",
+    "numpy",
+    "scipy",
+    "h5py",
+)
+"""Distributions that an episode depends on: physics, scenes and meshes, arithmetic, and the file."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +49,11 @@ class KnownEnv:
     kwargs: dict[str, Any] = field(default_factory=dict)
     steps: int = 240
     """Actions in an episode unless told otherwise."""
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """The Gymnasium ids of all its scenes."""
+        return tuple(self.env_id.replace("{scene}", scene) for scene in self.scenes or ("",))
 
 
 KNOWN_ENVS: dict[str, KnownEnv] = {
@@ -84,10 +102,13 @@ def usual_policy(name: str) -> str:
 
 
 def known_env(name: str) -> KnownEnv | None:
-    """The environment of this project that a short name or Gymnasium id means; None if it is another's."""
-    if name in KNOWN_ENVS:
-        return KNOWN_ENVS[name]
-    return next((known for known in KNOWN_ENVS.values() if known.env_id.partition("{")[0] in name), None)
+    """The environment of this project that a short name or Gymnasium id means; None if it is another's.
+
+    Args:
+        name: the short name, or the whole id, which may begin with the module to import, as in "envs:t3vip/DexHand-v0".
+    """
+    env_id = name.rpartition(":")[2]
+    return KNOWN_ENVS.get(name) or next((known for known in KNOWN_ENVS.values() if env_id in known.ids), None)
 
 
 def extra_kwargs(name: str, text: str) -> dict[str, Any]:
@@ -133,12 +154,13 @@ def make_env(env_id: str, env_kwargs: dict[str, Any], ground_truth: bool) -> gym
 
 
 def describe_env(env: gymnasium.Env, env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
-    """The attributes of a shard that follow from the environment, which may state its own `gl_renderer`.
+    """The attributes of a shard that follow from the environment.
 
     Raises:
-        UsageError: no OpenGL works.
+        UsageError: no OpenGL works, for an environment that draws with it.
     """
     inner: Any = env.unwrapped
+    drawn_here = isinstance(inner, RGBDEnv)  # what draws another's pictures, only that one knows
     attrs = {
         "env_id": env_id,
         "env_kwargs": env_kwargs,
@@ -149,9 +171,9 @@ def describe_env(env: gymnasium.Env, env_id: str, env_kwargs: dict[str, Any]) ->
         "body_names": list(getattr(inner, "body_names", [])),
         "hand_body_ids": [int(body) for body in getattr(inner, "hand_body_ids", ())],
         "versions": versions(),
-        "gl_renderer": inner.gl_renderer if hasattr(inner, "gl_renderer") else gl_renderer(),
+        "gl_renderer": gl_renderer() if drawn_here else str(getattr(inner, "gl_renderer", "unknown")),
     }
-    if hasattr(inner, "workspace"):
+    if getattr(inner, "workspace", None) is not None:
         attrs["workspace"] = [np.asarray(corner, float).tolist() for corner in inner.workspace]
     return attrs
 

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from data_collection.dataset import RGBDDataset
-from data_collection.files import written_aside
+from data_collection.environments import KNOWN_ENVS, known_env
 from data_collection.pictures import colour_depth
 from data_collection.schema import quantise_depth
 from envs.command import run
 from envs.dexhand import DexHandEnv
 from envs.errors import UsageError
+from envs.files import written_aside
 
 COLOURS = 256  # of the picture
 
@@ -44,7 +45,7 @@ class Config:
 def main(config: Config) -> None:
     """Restore the moments, draw them."""
     dataset = RGBDDataset(config.data)
-    if "DexHand" not in str(dataset.attrs["env_id"]):
+    if known_env(str(dataset.attrs["env_id"])) is not KNOWN_ENVS["dexhand"]:
         raise UsageError(f"{config.data} is of {dataset.attrs['env_id']}; give a dataset of --env dexhand")
     if config.episode >= dataset.episodes:
         raise UsageError(f"--episode is {config.episode}; {config.data} has episodes 0 to {dataset.episodes - 1}")

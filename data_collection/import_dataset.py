@@ -11,12 +11,12 @@ import tyro
 from tqdm import tqdm
 
 from data_collection.environments import versions
-from data_collection.files import locked, remove_leftovers
 from data_collection.importers import Source, SourceOptions, open_source
 from data_collection.importers.crew import import_parts
 from data_collection.importers.report import Report, check_continues, read_finished
 from envs.command import end_on_sigterm, run
 from envs.errors import UsageError
+from envs.files import locked, remove_leftovers
 
 
 @dataclass(frozen=True)

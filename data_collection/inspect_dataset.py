@@ -10,13 +10,13 @@ import numpy as np
 import tyro
 
 from data_collection.dataset import RGBDDataset
-from data_collection.files import write_json
 from data_collection.manifest import read_manifest
 from data_collection.pictures import write_contact_sheet, write_film
 from data_collection.repair import find_damage, repair
 from data_collection.statistics import describe
 from envs.command import run
 from envs.errors import UsageError
+from envs.files import write_json
 
 REPORT_FOLDER = "inspection"
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from data_collection.files import write_json
 from data_collection.policies.stable_baselines import without_folder
 from data_collection.schema import SCHEMA_VERSION
 from envs.errors import UsageError
+from envs.files import write_json
 
 MANIFEST_NAME = "dataset.json"
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_collection.dataset import RGBDDataset
-from data_collection.files import written_aside
 from data_collection.video import write_video
+from envs.files import written_aside
 
 SHEET_FRAMES = 10
 TILE = 128  # pixels: least edge of a frame in a picture

@@ -22,11 +22,11 @@ import ray
 from ray.exceptions import ActorDiedError, ActorUnavailableError, RayError
 
 from data_collection.episodes import EpisodeMaker
-from data_collection.files import written_aside
 from data_collection.manifest import Manifest
 from data_collection.workers import ONE_THREAD, START_SECONDS, Worker, WorkerPool, log_failure
 from data_collection.writer import shard_path
 from envs.errors import UsageError
+from envs.files import written_aside
 
 POLL_S = 5.0
 
@@ -158,7 +158,7 @@ class RayWorker(Worker):
             return "failed", _describe_death(error)
         if answer.kind == "placed":
             self.place = answer.detail
-            self.be_patient(START_SECONDS)
+            self.be_patient(START_SECONDS, "it was not ready")
             return None
         if answer.kind == "ready":
             self.be_patient(self._timeout)

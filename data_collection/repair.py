@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
-from data_collection.attributes import FROM_CAMERA, complete_attributes
-from data_collection.files import locked, remove_leftovers
-from data_collection.schema import SHARD_PATTERN, DamagedShard
+from data_collection.attributes import FROM_CAMERA
+from data_collection.schema import SHARD_PATTERN, DamagedShard, Shard
 from data_collection.writer import intact_episodes, read_episode, write_shard
 from envs.errors import UsageError
+from envs.files import locked, remove_leftovers, written_aside
 
 DAMAGED_FOLDER = "damaged"
 
@@ -33,6 +34,8 @@ def find_damage(folder: Path) -> list[str]:
 
 def repair(folder: Path) -> list[str]:
     """Move damaged shards into `folder/damaged`; the intact episodes of such a shard are written again.
+
+    Whenever it is killed, and whatever fails, each intact episode is in a shard of the folder.
 
     Returns:
         one line for each thing done; `collect-rollouts` makes dropped episodes again.
@@ -60,19 +63,44 @@ def _repair_shard(path: Path) -> list[str]:
     if all(intact):
         return []
     kept = [number for number, whole in enumerate(intact) if whole]
-    episodes = [read_episode(shard, number) for number in kept]
-    attrs = {name: value for name, value in shard.attrs.items() if name not in ("schema", *FROM_CAMERA)}
-    if kept:
-        complete_attributes(attrs, shard.columns)  # what cannot be written again is not moved
-    aside = _move_aside(path)
-    if kept:
-        ended = [bool(shard.ep_terminated[number]) for number in kept]
-        write_shard(path, episodes, attrs, [int(shard.ep_index[number]) for number in kept], ended)
+    aside = _rewrite(shard, kept) if kept else _move_aside(path)
     dropped = ", ".join(str(index) for index, whole in zip(shard.ep_index, intact, strict=True) if not whole)
     return [f"dropped episode {dropped} of {path.name}: checksum differs; kept as {aside}"]
 
 
+def _rewrite(shard: Shard, kept: list[int]) -> Path:
+    """Put a shard of these episodes in the place of a damaged one; where that one is kept, relative to the dataset."""
+    attrs = {name: value for name, value in shard.attrs.items() if name not in ("schema", *FROM_CAMERA)}
+    with written_aside(shard.path) as path:
+        write_shard(
+            path,
+            [read_episode(shard, number) for number in kept],
+            attrs,
+            [int(shard.ep_index[number]) for number in kept],
+            [bool(shard.ep_terminated[number]) for number in kept],
+        )
+        return _copy_aside(shard.path)
+
+
+def _copy_aside(path: Path) -> Path:
+    """Give a damaged shard a second name, so that it has its own one until another shard takes that."""
+    aside = _name_aside(path)
+    try:
+        aside.hardlink_to(path)
+    except OSError:  # a file system without hard links
+        with written_aside(aside) as copy:
+            shutil.copyfile(path, copy)
+    return aside.relative_to(path.parent)
+
+
 def _move_aside(path: Path) -> Path:
+    aside = _name_aside(path)
+    os.replace(path, aside)
+    return aside.relative_to(path.parent)
+
+
+def _name_aside(path: Path) -> Path:
+    """A free name for a damaged shard, in the folder for such."""
     folder = path.parent / DAMAGED_FOLDER
     folder.mkdir(exist_ok=True)
     aside = folder / path.name
@@ -80,5 +108,4 @@ def _move_aside(path: Path) -> Path:
     while aside.exists():
         aside = folder / f"{path.name}.{number}"
         number += 1
-    os.replace(path, aside)
-    return aside.relative_to(path.parent)
+    return aside

@@ -13,6 +13,9 @@ from envs.errors import UsageError
 
 NEEDED = ("camera", "get_state", "ACTION_AGGREGATION", "ACTION_SCALE", "control_rate")
 NEEDED_FOR_GROUND_TRUTH = ("segmentation", "body_poses", "body_names", "hand_body_ids")
+WORKSPACE = (2, 3)
+"""Shape of a workspace: its low and its high corner, m. Where the end-effector is in it, the first three numbers of
+`proprio` say."""
 MAX_BODIES = int(np.iinfo(COLUMNS["segmentation"].dtype).max) + 1
 
 
@@ -49,6 +52,12 @@ def check_env(env: gymnasium.Env, env_id: str, ground_truth: bool) -> None:
                 f"environment '{env_id}' has {name} {getattr(inner, name)!r}; it must have one for each of the "
                 f"{action.shape[0]} numbers of an action"
             )
+    workspace = getattr(inner, "workspace", None)
+    if workspace is not None and np.shape(workspace) != WORKSPACE:
+        raise UsageError(
+            f"environment '{env_id}' has a workspace of shape {np.shape(workspace)}; make it {WORKSPACE}, the low and "
+            "high corner that the first three numbers of proprio go through, or leave it out"
+        )
     if ground_truth and len(inner.body_names) > MAX_BODIES:
         raise UsageError(
             f"environment '{env_id}' has {len(inner.body_names)} bodies, and a dataset stores ids of {MAX_BODIES}; "

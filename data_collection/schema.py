@@ -17,6 +17,8 @@ shard-00007.h5
   ep_hash      (E, 32)         uint8    SHA-256 of the episode's columns
   ep_terminated (E,)           uint8    optional: 1 where an episode ended in a terminal state; none did without it
   attributes: numbers and JSON strings, `ATTRIBUTES`
+
+Whatever else somebody has put into the file is theirs: it is not looked at, and no sign of damage.
 """
 
 from __future__ import annotations
@@ -35,6 +37,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.depth import clipped_depth
 from envs.errors import UsageError
 
 SCHEMA_VERSION = 1
@@ -68,6 +71,8 @@ COLUMNS: dict[str, Column] = {
 GROUND_TRUTH = ("segmentation", "body_pose")
 EPISODE_TABLES = ("ep_len", "ep_offset", "ep_index", "ep_hash")
 OPTIONAL_TABLE = "ep_terminated"
+TABLE_ROWS = {"ep_hash": (32,)}
+"""What a table has for an episode, where that is more than a number."""
 
 NUMBERS = ("schema", "seed", "control_rate", "K", "world_T_camera", "near", "far")
 JSON_STRINGS = (
@@ -118,15 +123,10 @@ def quantise_depth(metres: NDArray[Any], near: float, far: float) -> NDArray[np.
     """Depth in metres, any shape -> uint16 over [near, far], clipped to it.
 
     Raises:
-        UsageError: it has NaN, which cast to a whole number would be a surface at the near plane.
+        UsageError: it is no depth in metres, or has holes; see `clipped_depth`.
     """
-    holes = np.count_nonzero(np.isnan(metres))
-    if holes:
-        raise UsageError(
-            f"depth has NaN in {holes} of {np.size(metres)} pixels; fill such holes first, as with what is around them"
-        )
-    unit = (np.asarray(metres, np.float64) - near) / (far - near)
-    return np.rint(np.clip(unit, 0.0, 1.0) * DEPTH_STEPS).astype(np.uint16)
+    unit = (clipped_depth(metres, near, far) - near) / (far - near)
+    return np.rint(unit * DEPTH_STEPS).astype(np.uint16)
 
 
 def dequantise_depth(raw: NDArray[np.uint16], near: float, far: float) -> NDArray[np.float32]:
@@ -139,7 +139,10 @@ def dequantise_depth(raw: NDArray[np.uint16], near: float, far: float) -> NDArra
 
 def encode_attributes(attrs: Mapping[str, Any]) -> dict[str, Any]:
     """Python values -> numbers and JSON strings, as HDF5 stores them."""
-    return {name: np.asarray(value) if name in NUMBERS else json.dumps(value) for name, value in attrs.items()}
+    return {
+        name: np.asarray(value) if name in NUMBERS or isinstance(value, np.ndarray) else json.dumps(value)
+        for name, value in attrs.items()
+    }
 
 
 def episode_hash(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
@@ -163,10 +166,14 @@ def read_shard(path: Path) -> Shard:
     try:
         with h5py.File(path, "r") as file:
             attrs = _read_attributes(path, file)
-            stored = dict(file.items())
-            tables = {name: stored.pop(name)[()] for name in EPISODE_TABLES if name in stored}
-            terminated = stored.pop(OPTIONAL_TABLE)[()] if OPTIONAL_TABLE in stored else None
-            columns = {name: (column.shape, str(column.dtype)) for name, column in stored.items()}
+            named = set(file)
+            stored = {name: file[name] for name in (*EPISODE_TABLES, OPTIONAL_TABLE, *COLUMNS) if name in named}
+            groups = [name for name, found in stored.items() if not isinstance(found, h5py.Dataset)]
+            if groups:
+                raise DamagedShard(path, f"'{groups[0]}' holds no values")
+            tables = {name: np.asarray(stored[name][()]) for name in EPISODE_TABLES if name in stored}
+            terminated = np.asarray(stored[OPTIONAL_TABLE][()]) if OPTIONAL_TABLE in stored else None
+            columns = {name: (stored[name].shape or (), str(stored[name].dtype)) for name in COLUMNS if name in stored}
     except (OSError, KeyError, RuntimeError, ValueError) as error:
         if isinstance(error, UsageError):
             raise
@@ -174,17 +181,17 @@ def read_shard(path: Path) -> Shard:
     for name in EPISODE_TABLES:
         if name not in tables:
             raise DamagedShard(path, f"no table '{name}'")
+    episodes = np.size(tables["ep_len"])
+    terminated = np.zeros(episodes, np.uint8) if terminated is None else terminated
+    for name, table in {**tables, OPTIONAL_TABLE: terminated}.items():
+        if table.shape != (episodes, *TABLE_ROWS.get(name, ())) or table.dtype.kind not in "iu":
+            raise DamagedShard(path, f"{name} is {table.dtype} {table.shape}, for {episodes} episodes")
     rows = int(tables["ep_len"].sum())
-    starts = np.concatenate([[0], np.cumsum(tables["ep_len"])[:-1]]) if len(tables["ep_len"]) else tables["ep_len"]
-    if not np.array_equal(starts, tables["ep_offset"]):
+    if not np.array_equal(np.cumsum(tables["ep_len"]) - tables["ep_len"], tables["ep_offset"]):
         raise DamagedShard(path, "ep_offset does not follow from ep_len")
-    if terminated is None:
-        terminated = np.zeros(len(starts), np.uint8)
-    if terminated.shape != starts.shape:
-        raise DamagedShard(path, f"{OPTIONAL_TABLE} is {terminated.shape}, for {len(starts)} episodes")
     for name, (shape, dtype) in columns.items():
-        expected = COLUMNS.get(name)
-        if expected is not None and (dtype != expected.dtype or len(shape) != expected.ndim):
+        expected = COLUMNS[name]
+        if dtype != expected.dtype or len(shape) != expected.ndim:
             wanted = f"{expected.dtype} of {expected.ndim} axes"
             raise DamagedShard(path, f"column '{name}' is {dtype} {shape}, not {wanted}")
         if shape[:1] != (rows,):
@@ -214,16 +221,26 @@ def _read_attributes(path: Path, file: h5py.File) -> dict[str, Any]:
             f"{path} has schema version {version}, this program reads {SCHEMA_VERSION}; "
             "collect the dataset again, or use the program version that wrote it"
         )
-    missing = [name for name in ATTRIBUTES if name not in file.attrs]
+    attrs = {name: _decode(name, value) for name, value in file.attrs.items() if _is_plain(value)}
+    missing = [name for name in ATTRIBUTES if name not in attrs]
     if missing:
         raise UsageError(f"{path} has no attribute '{missing[0]}'; write it with all that docs/data.md lists")
-    return {name: _decode(name, value) for name, value in file.attrs.items()}
+    return attrs
+
+
+def _is_plain(value: Any) -> bool:
+    return isinstance(value, str) or np.asarray(value).dtype.kind in "biuf"
 
 
 def _decode(name: str, value: Any) -> Any:
-    if isinstance(value, str):
+    if not isinstance(value, str):
+        return value.item() if np.ndim(value) == 0 else np.asarray(value)
+    try:
         return json.loads(value)
-    return value.item() if np.ndim(value) == 0 else np.asarray(value)
+    except ValueError:
+        if name in ATTRIBUTES:
+            raise
+        return value  # somebody else's words
 
 
 def _first_line(error: BaseException) -> str:

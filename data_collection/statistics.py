@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_collection.dataset import RGBDDataset
+from data_collection.environments import KNOWN_ENVS, known_env
 from data_collection.goal_statistics import goal_statistics
+from data_collection.requirements import WORKSPACE
 
 VOXEL = 0.05  # metres: edge of the cells in which workspace coverage is counted
 
@@ -47,12 +49,12 @@ def describe(dataset: RGBDDataset) -> dict[str, Any]:
         "content_hash": dataset.content_hash,
         "columns": column_ranges(dataset),
     }
-    proprio = dataset.load("proprio")
-    if "workspace" in dataset.attrs and proprio.shape[1] >= 3:
+    proprio, env = dataset.load("proprio"), known_env(str(dataset.attrs["env_id"]))
+    if np.shape(dataset.attrs.get("workspace", ())) == WORKSPACE and proprio.shape[1] >= 3:
         report["workspace"] = workspace_coverage(proprio[:, :3], np.asarray(dataset.attrs["workspace"]))
-    if "scene_obs" in dataset.columns and "Tabletop" in str(dataset.attrs["env_id"]):
+    if "scene_obs" in dataset.columns and env is KNOWN_ENVS["tabletop"]:
         report["moved"] = moved_shares(dataset.load("scene_obs"), dataset.episode_slices)
-    if "scene_obs" in dataset.columns and "DexHand" in str(dataset.attrs["env_id"]):
+    if "scene_obs" in dataset.columns and env is KNOWN_ENVS["dexhand"]:
         report["goals"] = goal_statistics(dataset.load("scene_obs"), dataset.episode_slices)
     return report
 

@@ -14,11 +14,11 @@ import gymnasium
 import numpy as np
 from tqdm import tqdm
 
-from data_collection.environments import resolve_env
-from data_collection.files import write_json, written_aside
+from data_collection.environments import KNOWN_ENVS, known_env, resolve_env
 from data_collection.policies.stable_baselines import SUFFIX, load_model
 from envs.command import run
 from envs.errors import UsageError
+from envs.files import write_json, written_aside
 
 DISCOUNT, POLYAK, GOALS_A_STEP = 0.98, 0.05, 4  # Plappert et al. (2018), but for the discount of a shorter episode
 LEARNING_STARTS = 1000  # steps before the first update
@@ -138,10 +138,13 @@ def save(model: Any, path: Path) -> None:
 
 def _make_env(config: Config) -> gymnasium.Env:
     env_id, env_kwargs = resolve_env(config.env, None)
-    if config.env == "dexhand" or "DexHand" in env_id:
+    known = known_env(env_id)
+    if known is not None:  # another's may always be without pictures, or not know the word
+        env_kwargs = {**env_kwargs, "images": False}
+    if known is KNOWN_ENVS["dexhand"]:
         env_kwargs = {**env_kwargs, "goal_angle": config.goal_angle, "reward_type": config.reward, "new_goals": False}
     try:
-        env = gymnasium.make(env_id, disable_env_checker=True, **{**env_kwargs, "images": False})
+        env = gymnasium.make(env_id, disable_env_checker=True, **env_kwargs)
     except (gymnasium.error.Error, ModuleNotFoundError, TypeError) as error:
         raise UsageError(f"cannot make environment '{env_id}': {error}; check --env") from error
     if not hasattr(env.unwrapped, "compute_reward"):

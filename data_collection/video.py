@@ -11,8 +11,8 @@ import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
 
-from data_collection.files import written_aside
 from envs.errors import UsageError
+from envs.files import written_aside
 
 
 def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float, quality: float = 5) -> None:

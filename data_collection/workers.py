@@ -48,11 +48,12 @@ class Worker(ABC):
     def __init__(self, name: str, timeout: float, episode: int) -> None:
         self.name, self.episode = name, episode
         self._timeout = timeout
-        self.be_patient(START_SECONDS)
+        self.be_patient(START_SECONDS, "it was not ready")
 
-    def be_patient(self, seconds: float) -> None:
-        """From now on it may be silent for so long."""
+    def be_patient(self, seconds: float, otherwise: str = "the episode was not done") -> None:
+        """From now on it may be silent for so long; `otherwise` is what to say of it then."""
         self.deadline = time.monotonic() + seconds
+        self._fault = f"hung: {otherwise} in {seconds:g} s"
 
     @property
     def overdue(self) -> bool:
@@ -61,7 +62,7 @@ class Worker(ABC):
 
     def hung(self) -> tuple[str, str]:
         """The news of a worker that is overdue."""
-        return "failed", f"hung: the episode was not done in {self._timeout:g} s"
+        return "failed", self._fault
 
     def begin(self, episode: int) -> None:
         """Have it collect an episode, after the one that it has just done."""

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_collection.attributes import complete_attributes
-from data_collection.files import written_aside
 from data_collection.schema import (
     COLUMNS,
     DamagedShard,
@@ -26,6 +25,8 @@ from data_collection.schema import (
     read_shard,
     unreadable,
 )
+from envs.errors import UsageError
+from envs.files import written_aside
 
 CHUNK_BYTES = 1 << 19  # a chunk is a run of frames of one clip; half a megabyte stays in the cache while it is unpacked
 
@@ -54,8 +55,15 @@ def write_shard(
 
     Raises:
         ValueError: a column is not what the schema says.
-        UsageError: an attribute is missing, or does not fit the columns.
+        UsageError: there are no episodes, a table is not as long as they are many, or an attribute is missing or does
+            not fit the columns.
     """
+    if not episodes:
+        raise UsageError(f"no episodes for {path.name}; give one or more, and write no shard where there are none")
+    ended = list(ep_terminated) or [False] * len(episodes)
+    for name, given in (("ep_index", ep_index), ("ep_terminated", ended)):
+        if len(given) != len(episodes):
+            raise UsageError(f"{name} has {len(given)} for {len(episodes)} episodes; give one for each")
     for columns in episodes:
         _check(columns, episodes[0])
     complete = complete_attributes(attrs, {name: values.shape[1:] for name, values in episodes[0].items()})
@@ -66,8 +74,8 @@ def write_shard(
         "ep_index": np.asarray(ep_index, np.int64),
         "ep_hash": np.stack([episode_hash(columns) for columns in episodes]),
     }
-    if any(ep_terminated):
-        tables["ep_terminated"] = np.array(ep_terminated, np.uint8)
+    if any(ended):
+        tables["ep_terminated"] = np.array(ended, np.uint8)
     with written_aside(path) as aside, h5py.File(aside, "w", libver=("v110", "v110")) as file:
         for name, values in encode_attributes(complete).items():
             file.attrs[name] = values
@@ -121,6 +129,8 @@ def _check(columns: Mapping[str, NDArray[Any]], first: Mapping[str, NDArray[Any]
     if columns.keys() != first.keys():
         raise ValueError(f"episodes of one shard with different columns: {sorted(columns)} and {sorted(first)}")
     rows = len(columns["action"])
+    if not rows:
+        raise ValueError("an episode without rows; one of T actions has T + 1")
     for name, values in columns.items():
         expected = COLUMNS.get(name)
         if expected is None:

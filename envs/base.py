@@ -81,7 +81,7 @@ class RGBDEnv(gymnasium.Env, ABC):
         """The picture of the static camera, in the way that `render_mode` says."""
         if self.render_mode is None:
             return None
-        rgb, depth = self._look()
+        rgb, depth = (image.copy() for image in self._look())  # the caller may draw on them
         return {"rgb_array": rgb, "depth_array": depth, "rgbd_tuple": (rgb, depth)}[self.render_mode]
 
     def close(self) -> None:

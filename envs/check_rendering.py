@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import time
@@ -14,6 +13,7 @@ import numpy as np
 
 from envs.command import run
 from envs.errors import UsageError
+from envs.files import write_json
 from envs.rendering import StaticCamera
 
 TOLERANCE_MM = 1.0
@@ -141,7 +141,7 @@ def main(config: Config) -> None:
     print("OK" if findings.ok else f"FAILED: depth is off by more than {TOLERANCE_MM} mm")
     if config.json is not None:
         try:
-            config.json.write_text(json.dumps(asdict(findings) | {"ok": findings.ok}, indent=2) + "\n")
+            write_json(config.json, asdict(findings) | {"ok": findings.ok})
         except OSError as error:
             raise UsageError(
                 f"cannot write {config.json} ({error.strerror}); give a file in a folder that exists"

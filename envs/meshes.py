@@ -10,7 +10,6 @@ import contextlib
 import hashlib
 import itertools
 import os
-import tempfile
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.errors import UsageError
+from envs.files import written_aside
 
 CACHE_FORMAT = b"t3vip-mesh-1"  # part of every key: raise it when the result of `decimate` changes
 WELD_DECIMALS = 5  # vertices closer than 0.01 mm are one; exporters split them at every edge
@@ -129,14 +129,7 @@ def _weld(vertices: NDArray, faces: NDArray) -> Mesh:
 
 
 def _store(path: Path, mesh: Mesh) -> None:
-    """Write aside, then rename: workers that start together never see half a file."""
+    """Written aside, so that workers that start together never see half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-        try:
-            np.savez_compressed(file, vertices=mesh.vertices, faces=mesh.faces)
-            file.flush()
-            os.fsync(file.fileno())
-            os.replace(file.name, path)
-        except BaseException:
-            os.unlink(file.name)
-            raise
+    with written_aside(path) as aside, aside.open("wb") as file:
+        np.savez_compressed(file, vertices=mesh.vertices, faces=mesh.faces)

@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from data_collection.files import written_aside
+from envs.files import written_aside
 from planning.episode import Record
 from planning.report import AXIS_BINS, TITLES, aligned, in_part, parting, parts_of
 from planning.statistics import Pairs, sign_flip_p

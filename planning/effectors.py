@@ -3,32 +3,39 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.errors import UsageError
 from envs.planar_push import control as push_control
 from envs.planar_push.scene import TIP_HEIGHT
 from envs.tabletop import control as arm_control
 from planning.costs import env_action
+from planning.observations import Observation
 
 Array = NDArray[np.float64]
-Observation = dict[str, Any]
 
 TCP = slice(0, 3)  # position of the end-effector in `proprio` of the tabletop, metres, world
 GRIPPER = 14  # last gripper command in it
+PROPRIO = 15
 
 
 class Effector(ABC):
-    """An end-effector that goes where it is told, along the world's x and y, or x, y and z.
+    """An end-effector, and what a controller may tell it.
+
+    A move is what is planned: how far to go along the world's x and y, or x, y and z. Controllers with a world model
+    also plan moves of any other kind, of joints for example, where no `Reach` draws the end-effector to a thing: the
+    model knows where those lead.
 
     Attributes:
         axes: numbers in a move.
         action_dim: numbers in an action of the environment.
         limit: the largest number in a planned move.
-        metres: that a move of 1 goes in one control step.
-        low, high: corners (3,) of the box that it stays in, metres.
+        metres: that a move of 1 goes in one control step; where moves are along the world's axes.
+        low, high: corners (3,) of the box that it stays in, metres; where moves are along the world's axes.
+        aggregation, scale: how each number of an action adds up, and what 1 stands for in it, as in datasets; a model
+            that learned from other actions is refused. None: not compared.
     """
 
     axes: int
@@ -37,6 +44,8 @@ class Effector(ABC):
     metres: float
     low: Array
     high: Array
+    aggregation: tuple[str, ...] | None = None
+    scale: tuple[float, ...] | None = None
 
     def reset(self, observation: Observation) -> None:  # noqa: B027  # most bodies remember nothing
         """Start an episode with its first observation."""
@@ -50,7 +59,37 @@ class Effector(ABC):
 
     @abstractmethod
     def action(self, move: NDArray) -> NDArray[np.float32]:
-        """Moves (..., axes) as actions (..., action_dim) of the environment."""
+        """Moves (..., axes), any number of them at once, as actions (..., action_dim) of the environment."""
+
+    def check(self, observation: Observation) -> None:
+        """Check that it reads this observation, and makes actions of moves, as a controller expects; after `reset`.
+
+        Raises:
+            UsageError: it does not.
+        """
+        name = type(self).__name__
+        place = np.asarray(self.position(observation), np.float64)
+        if place.shape != (3,) or not np.isfinite(place).all():
+            raise UsageError(
+                f"{name}.position gives {place.tolist()}; make it three finite numbers, metres, world frame"
+            )
+        made, wanted = np.shape(self.action(np.zeros((2, 4, self.axes)))), (2, 4, self.action_dim)
+        if made != wanted:
+            raise UsageError(
+                f"{name}.action makes actions {made} of moves {(2, 4, self.axes)}; make it {wanted}, one for each move"
+            )
+
+    def check_follows_axes(self) -> None:
+        """Refuse moves that are not along the world's axes.
+
+        Raises:
+            UsageError: they are others.
+        """
+        if self.axes > 3:
+            raise UsageError(
+                f"a move of the {type(self).__name__} is {self.axes} numbers, not along x and y, or x, y and z; only"
+                " controllers with a world model plan such moves"
+            )
 
     def path(self, observation: Observation, moves: NDArray, hold: int) -> Array:
         """Where moves (N, h, axes), each held for `hold` control steps, take it if nothing is in the way: (N, h, 3)."""
@@ -63,9 +102,15 @@ class Arm(Effector):
     """The arm of the tabletop: it is translated, never turned, and the gripper keeps its command of the start."""
 
     axes, action_dim, limit, metres = 3, 7, 1.0, arm_control.ACTION_SCALE[0]
+    aggregation, scale = arm_control.ACTION_AGGREGATION, arm_control.ACTION_SCALE
     low, high = arm_control.WORKSPACE_LOW, arm_control.WORKSPACE_HIGH
 
     def reset(self, observation: Observation) -> None:
+        if np.shape(observation["proprio"]) != (PROPRIO,):
+            raise UsageError(
+                f"proprio has shape {np.shape(observation['proprio'])}, that of the tabletop's Arm {(PROPRIO,)}; give"
+                " the effector of your robot, a planning.effectors.Effector: effector=..."
+            )
         self.gripper = held_gripper(observation)
 
     def position(self, observation: Observation) -> Array:
@@ -87,6 +132,7 @@ class Tip(Effector):
     """
 
     axes, action_dim, limit, metres = 2, 3, 0.5, push_control.ACTION_SCALE[0]
+    aggregation, scale = push_control.ACTION_AGGREGATION, push_control.ACTION_SCALE
     low = np.append(push_control.WORKSPACE_LOW, TIP_HEIGHT)
     high = np.append(push_control.WORKSPACE_HIGH, TIP_HEIGHT)
 

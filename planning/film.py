@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from data_collection.files import written_aside
 from data_collection.video import write_video
 from envs.camera import CameraModel
+from envs.files import written_aside
 from envs.rendering import StaticCamera
 from planning.episode import Record, mark_of
 from planning.marks import point_position

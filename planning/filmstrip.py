@@ -9,7 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 
-from data_collection.files import written_aside
+from envs.files import written_aside
 from planning.episode import Record
 from planning.film import VIEWS, film_path
 

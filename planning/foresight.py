@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.stats import spearmanr
 from tqdm import tqdm
 
-from data_collection.files import write_json
 from envs import command
 from envs.errors import UsageError
+from envs.files import write_json
 from planning.controllers.base import Observation
 from planning.controllers.kit import Kit
 from planning.controllers.oracle import OracleController

@@ -11,8 +11,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from data_collection.files import write_json
 from envs.errors import UsageError
+from envs.files import write_json
 from planning.episode import Record
 
 CONFIG_NAME, EPISODES_NAME = "config.json", "episodes.jsonl"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from data_collection.files import written_aside
+from envs.files import written_aside
 from planning.episode import Record
 from planning.statistics import wilson_interval
 

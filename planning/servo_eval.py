@@ -14,8 +14,8 @@ import tyro
 from tqdm import tqdm
 
 import envs.command
-from data_collection.files import locked, write_json
 from envs.errors import UsageError
+from envs.files import locked, write_json
 from planning.comparison import comparison_chart, difference_table, differences
 from planning.controllers import CONTROLLERS, LEARNED, PIXEL_MODELS, Kit
 from planning.episode import Record, mark_of, run_episode

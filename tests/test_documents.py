@@ -11,9 +11,12 @@ import shlex
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import envs.command
+from worldmodel.train import main as train
+from worldmodel.train import parse_options
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")))
@@ -235,6 +238,17 @@ def test_python_runs(document, folder):
     block = fences(document, "python")[number]
     assert long in block
     exec(compile(block.replace(long, short) if long else block, document, "exec"), {})
+
+
+def test_a_robot_of_ones_own(folder):
+    """Own data, a model that learns from them, and a controller that plans with it, as two documents tell it."""
+    names: dict[str, object] = {}
+    (recording,) = (block for block in fences("docs/data.md", "python") if "write_shard(" in block)
+    exec(recording, names)
+    train(parse_options(["--preset", "tiny", "--data", "data/mine", "--out", "runs/mine", "--steps", "2"]))
+    (control,) = (block for block in fences("docs/planning.md", "python") if "class Tool" in block)
+    exec(control.replace("range(30)", "range(4)"), names)
+    assert isinstance(names["place"], np.ndarray) and np.abs(names["place"]).max() > 0  # it was moved
 
 
 def anchors(document: Path) -> set[str]:

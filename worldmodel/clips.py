@@ -197,7 +197,8 @@ class ClipSource:
         if lengths.max(initial=0) < span:
             raise UsageError(
                 f"no episode is {span} frames long, as {frames} frames at gap {self.frame_gap} need (the longest has "
-                f"{lengths.max(initial=0)}); choose a smaller clip length or frame gap"
+                f"{lengths.max(initial=0)}); choose a smaller frame gap or shorter clips, in training by --frame-gap "
+                "or --schedule.clip-lengths"
             )
         long = lengths >= span
         return self._slices[long, 0], np.cumsum(lengths[long] - span + 1)

@@ -11,9 +11,9 @@ import tyro
 from tqdm import tqdm
 
 from data_collection.dataset import RGBDDataset
-from data_collection.files import locked, write_json, written_aside
 from envs import command as command_line
 from envs.errors import UsageError
+from envs.files import locked, write_json, written_aside
 from worldmodel import evaluation_report as report
 from worldmodel.checkpoint import content_hashes, load_inference, load_model, load_origin
 from worldmodel.clips import ClipSource

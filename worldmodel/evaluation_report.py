@@ -8,7 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from data_collection.files import written_aside
+from envs.files import written_aside
 from worldmodel.scores import PICTURE_SCORES, SCORES, Score
 
 Entry = Mapping[str, Any]

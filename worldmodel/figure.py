@@ -11,8 +11,8 @@ import numpy as np
 from PIL import Image as Pillow
 from PIL import ImageDraw
 
-from data_collection.files import written_aside
 from data_collection.video import write_video
+from envs.files import written_aside
 from worldmodel.colours import Image
 from worldmodel.legends import DARK, GREY, Scales, font, legend
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
-from data_collection.files import written_aside
+from envs.files import written_aside
 from worldmodel.scores import number
 
 

@@ -23,8 +23,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from data_collection.files import written_aside
 from envs.errors import UsageError
+from envs.files import written_aside
 from envs.meshes import cache_dir
 
 FILE = "lpips-vgg16.safetensors"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 
-from data_collection.files import locked, write_json, written_aside
 from envs import command as command_line
 from envs.errors import UsageError
+from envs.files import locked, write_json, written_aside
 from worldmodel.study import figures, report
 from worldmodel.study.options import StudyOptions
 from worldmodel.study.results import collect

@@ -11,7 +11,7 @@ from typing import Any
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from data_collection.files import written_aside
+from envs.files import written_aside
 from worldmodel.scores import Statistics
 
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import torch
 
-from data_collection.files import locked, write_json
 from envs import command as command_line
 from envs.errors import UsageError
+from envs.files import locked, write_json
 from worldmodel.budget import Cost, measure_cost
 from worldmodel.clips import ClipSource
 from worldmodel.config_file import changed, read_config

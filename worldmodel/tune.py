@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from data_collection.files import locked
 from envs import command as command_line
+from envs.files import locked
 from worldmodel.tuning.options import TuneOptions
 from worldmodel.tuning.report import write_report
 from worldmodel.tuning.search import search, settle, unfinished

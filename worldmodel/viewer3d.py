@@ -23,9 +23,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from data_collection.files import written_aside
 from envs.camera import CameraModel
 from envs.errors import UsageError
+from envs.files import written_aside
 from worldmodel.clips import Clips, ClipTruth
 from worldmodel.colours import PALETTE, rgb_colours
 from worldmodel.figure import TRUTH

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_collection.dataset import RGBDDataset
-from data_collection.files import written_aside
 from data_collection.schema import COLUMNS, GROUND_TRUTH, encode_attributes
 from envs.errors import UsageError
+from envs.files import written_aside
 
 CHUNK_BYTES = 1 << 18
 

@@ -20,14 +20,16 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from data_collection.attributes import FROM_CAMERA
 from data_collection.dataset import RGBDDataset
-from data_collection.schema import COLUMNS, JSON_STRINGS
+from data_collection.schema import COLUMNS
 from envs.errors import UsageError
+from envs.files import written_aside
 
 FIELDS = ("rgb", "depth", "proprio", "action", "reward")
 """The columns that Minari has a field for."""
-REPEATED = ("camera", "versions")
-"""Attributes that stand elsewhere, or are about the making of single files."""
+LEFT_OUT = ("schema", *FROM_CAMERA, "versions", "imported_from")
+"""Attributes that repeat what the camera says, or are about single files."""
 
 
 def export_minari(
@@ -138,12 +140,12 @@ def _env_spec(dataset: RGBDDataset) -> gymnasium.envs.registration.EnvSpec | Non
 
 
 def _metadata(dataset: RGBDDataset, name: str, author: str | None, version: str) -> dict[str, Any]:
-    ours = {key: dataset.attrs[key] for key in JSON_STRINGS if key not in REPEATED}
-    ours |= {
-        "camera": dataset.camera.to_dict(),
-        "control_rate": dataset.attrs["control_rate"],
-        "content_hash": dataset.content_hash,
+    ours = {
+        key: value.tolist() if isinstance(value, np.ndarray) else value
+        for key, value in dataset.attrs.items()
+        if key not in LEFT_OUT
     }
+    ours["content_hash"] = dataset.content_hash
     metadata: dict[str, Any] = {
         "dataset_id": name,
         "minari_version": version,
@@ -161,4 +163,5 @@ def _name_spaces(root: Path, target: Path) -> None:
             return
         mark = folder / "namespace_metadata.json"
         if not mark.exists():
-            mark.write_text("{}")
+            with written_aside(mark) as aside:
+                aside.write_text("{}")

@@ -38,6 +38,8 @@ LENGTHS = "ep_lens.npy"
 NEAR, FAR = 3.7, 6.3  # metres: the table and what stands on it, from 4.2 m away
 ROBOT_OBS, SCENE_OBS = 15, 24
 UNIT_M, UNIT_RAD = 0.02, 0.05
+MOST_CLIPPED = 0.1
+"""A larger share of clipped actions is noted."""
 MISREADINGS = {"doubled": 2.0, "halved": 0.5, "in millimetres": 1000.0, "in centimetres": 100.0}
 
 
@@ -57,7 +59,9 @@ class CalvinSource:
     depth_scale: float
     notes: tuple[str, ...]
 
-    action_aggregation = ("sum",) * 6 + ("last",)  # its targets add up Euler angles, too, number by number
+    # `rel_actions` say how far the hand went to the next frame, in position and Euler angles, in units and clipped to
+    # -1 and 1. Number by number, such differences add up to those over several frames, but where they are clipped.
+    action_aggregation = ("sum",) * 6 + ("last",)
     action_scale = (UNIT_M, UNIT_M, UNIT_M, UNIT_RAD, UNIT_RAD, UNIT_RAD, 1.0)
 
     @property
@@ -115,6 +119,11 @@ def _columns(
     largest = float(np.abs(actions[:, :6]).max())
     if largest > 1 + 1e-6:
         notes.append(f"relative actions up to {largest:.3g}, not within -1 and 1")
+    clipped = float((np.abs(actions[:, :6]) == 1).any(axis=1).mean())
+    if clipped > MOST_CLIPPED:
+        notes.append(
+            f"{clipped:.0%} of the relative actions are clipped to -1 or 1: the arm went further than they say"
+        )
     notes += note_unit_of_motion(np.diff(robot[:, :3], axis=0), actions[:, :3], UNIT_M)
     columns: Columns = {
         "rgb": rgb,

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from data_collection.files import write_json
 from data_collection.importers.crew import ORIGIN, Outcome
 from data_collection.importers.source import Part
 from data_collection.schema import SHARD_PATTERN, DamagedShard, read_shard
 from envs.errors import UsageError
+from envs.files import write_json
 
 REPORT_NAME = "import.json"
 LINES_SHOWN = 20
@@ -121,10 +121,11 @@ def read_finished(folder: Path, parts: Sequence[Part]) -> dict[int, Outcome]:
         if not isinstance(origin, dict) or len(shard.ep_index) != 1:
             raise DamagedShard(path, f"no attribute '{ORIGIN}': not imported")
         index = int(shard.ep_index[0])
-        if index < len(parts) and parts[index].name != origin["part"]:
+        there = parts[index].name if index < len(parts) else f"past its {len(parts)} episodes"
+        if there != origin["part"]:
             raise UsageError(
-                f"{path} holds {origin['part']}, but there it is {parts[index].name} in the source; import from the "
-                "same source, or into another folder"
+                f"{path} holds {origin['part']}, but there it is {there} in the source; import from the same source, "
+                "or into another folder"
             )
         finished[index] = Outcome(index, origin["part"], None, tuple(origin["notes"]), shard.rows)
     return finished

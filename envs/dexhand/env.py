@@ -112,6 +112,7 @@ class DexHandEnv(RGBDEnv):
             self._goals_reached += 1
             info["goals_reached"] = self._goals_reached
             self._draw_goal()
+            self._after_physics()  # the goal is a body, too
         return self.observation(), reward, info["is_dropped"], False, info
 
     def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any) -> NDArray[np.float32]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from envs import command
 from envs.errors import UsageError
+from envs.files import written_aside
 from envs.planar_push.control import ACTION_SCALE
 from envs.planar_push.env import PlanarPushEnv
 
@@ -47,8 +47,8 @@ def main(config: Config) -> None:
     env.close()
     picture = np.concatenate([np.concatenate(row, axis=1) for row in (upper, lower)])
     path = config.out / "planar-push.png"
-    iio.imwrite(path.with_suffix(".tmp"), picture, extension=".png")
-    os.replace(path.with_suffix(".tmp"), path)
+    with written_aside(path) as aside:
+        iio.imwrite(aside, picture, extension=".png")
     print(path)
 
 

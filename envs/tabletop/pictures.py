@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from envs import command
 from envs.errors import UsageError
+from envs.files import written_aside
 from envs.tabletop.env import TabletopEnv
 from envs.tabletop.layouts import LAYOUTS
 
@@ -40,8 +40,8 @@ def main(config: Config) -> None:
         picture = np.concatenate([env.view("static", config.size), env.view("side", config.size)], axis=1)
         env.close()
         path = config.out / f"scene-{scene.lower()}.png"
-        iio.imwrite(path.with_suffix(".tmp"), picture, extension=".png")
-        os.replace(path.with_suffix(".tmp"), path)
+        with written_aside(path) as aside:
+            iio.imwrite(aside, picture, extension=".png")
         print(path)
 
 

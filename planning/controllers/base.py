@@ -11,12 +11,16 @@ from numpy.typing import NDArray
 
 from envs.errors import UsageError
 from planning.costs import Reach
-from planning.effectors import Arm, Effector, Observation, held_gripper
+from planning.effectors import Arm, Effector, held_gripper
 from planning.followers import EffectorFollower, Follower
 from planning.goals import Goal
 from planning.icem import ICEM, CostFunction
+from planning.observations import Observation
 
 __all__ = ["Controller", "Goal", "HoldingController", "Observation", "PlanningController", "held_gripper"]
+
+
+GOAL_NUMBERS = {"point_world": 3, "pixel": 2}
 
 
 class Controller(Protocol):
@@ -62,13 +66,14 @@ class HoldingController:
         """See `Controller`.
 
         Raises:
-            UsageError: the goal is no place.
+            UsageError: the goal is no place, or the effector does not do with what is observed.
         """
-        place = np.asarray(getattr(goal, self.knows), np.float64)
-        if not np.isfinite(place).all():
-            raise UsageError(f"the goal's {self.knows} is {place.tolist()}; give finite numbers")
+        place, numbers = np.asarray(getattr(goal, self.knows), np.float64), GOAL_NUMBERS[self.knows]
+        if place.shape != (numbers,) or not np.isfinite(place).all():
+            raise UsageError(f"the goal's {self.knows} is {place.tolist()}; give {numbers} finite numbers")
         self.goal = goal
         self.effector.reset(observation)
+        self.effector.check(observation)
         self.follower.reset(observation, goal)
         self.plan_seconds = []
         self._steps = 0
@@ -88,7 +93,7 @@ class HoldingController:
             self.action = self.effector.action(self.decide(observation))
             self.plan_seconds.append(time.perf_counter() - start)
         self._steps += 1
-        return self.action
+        return self.action.copy()  # the caller may change it, and it is held
 
     def way(self) -> NDArray[np.float64]:
         """Where the point has yet to go (3,), metres, world frame, by what the controller knows."""
@@ -128,6 +133,8 @@ class PlanningController(HoldingController):
                 f"the planner searches from {planner.low.tolist()} to {planner.high.tolist()}, but a move of the"
                 f" {type(self.effector).__name__} is {axes} numbers from {-limit} to {limit}; give such low and high"
             )
+        if reach is not None:
+            self.effector.check_follows_axes()
         self.planner, self.reach = planner, reach
 
     def reset(self, observation: Observation, goal: Goal) -> None:
@@ -138,11 +145,12 @@ class PlanningController(HoldingController):
         plan = self.planner.plan(self.imagine(observation))
         if not np.isfinite(plan.cost):
             warnings.warn(
-                f"{type(self).__name__} found no move of finite cost, and goes on as it last planned: what it predicts"
-                " is not finite, as with a model whose weights or frames are not",
+                f"{type(self).__name__} found no move of finite cost, and makes none: what it predicts is not finite,"
+                " as with a model whose weights are not",
                 RuntimeWarning,
                 stacklevel=2,
             )
+            return np.zeros(self.effector.axes)
         return plan.actions[0]
 
     def imagine(self, observation: Observation) -> CostFunction:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from planning.controllers.base import Goal, HoldingController, Observation, Plan
 from planning.costs import discounted_distance
 from planning.effectors import Effector
 from planning.followers import Follower
-from planning.icem import CostFunction
+from planning.icem import ICEM, CostFunction
 
 METRES_PER_ACTION = ACTION_SCALE[0]  # of a full translation of the arm over one control step
 
@@ -44,6 +45,7 @@ class ProportionalController(HoldingController):
 
     def __init__(self, effector: Effector | None = None, follower: Follower | None = None, gain: float = 0.5) -> None:
         super().__init__(1, effector, follower)
+        self.effector.check_follows_axes()
         self.gain = gain
 
     def decide(self, observation: Observation) -> NDArray:
@@ -60,6 +62,10 @@ class LinearController(PlanningController):
     """
 
     ridge = 1e-6  # keeps the fit defined; in squared action units, against probes of size 1
+
+    def __init__(self, planner: ICEM, hold: int, effector: Effector | None = None, **options: Any) -> None:
+        super().__init__(planner, hold, effector, **options)
+        self.effector.check_follows_axes()
 
     def reset(self, observation: Observation, goal: Goal) -> None:
         super().reset(observation, goal)

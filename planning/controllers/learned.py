@@ -13,8 +13,10 @@ from data_collection.actions import aggregate_actions
 from envs.camera import CameraModel
 from envs.errors import UsageError
 from planning.controllers.base import Goal, Observation, PlanningController
+from planning.effectors import Arm, Effector
 from planning.icem import ICEM
-from worldmodel.interface import camera_mismatch
+from planning.observations import taken_in
+from worldmodel.interface import TOLERANCE, camera_mismatch
 from worldmodel.models import KINDS
 
 
@@ -30,11 +32,12 @@ class LearnedController(PlanningController):
         camera: geometry of the camera that takes the frames; but for its pose, the one that the model was trained with.
         planner: searches sequences of moves, each held for `frame_gap` control steps.
         context_frames: frames that the model is shown before every plan.
-        options: effector, follower, reach; see `PlanningController`.
+        effector: what is moved; the arm of the tabletop when None.
+        options: follower, reach; see `PlanningController`.
 
     Raises:
         UsageError: the model is of another kind, was trained with another camera, takes other actions than the
-            effector's, or is to be shown no frame; in an episode: colours are not uint8.
+            effector's, or is to be shown no frame; in an episode: an observation is not what `taken_in` asks for.
 
     Attributes:
         kinds: of models that it can plan with; all, unless a subclass says otherwise.
@@ -50,6 +53,7 @@ class LearnedController(PlanningController):
         camera: CameraModel,
         planner: ICEM,
         context_frames: int = 2,
+        effector: Effector | None = None,
         **options: Any,
     ) -> None:
         if context_frames < 1:
@@ -65,22 +69,27 @@ class LearnedController(PlanningController):
                 f"the camera has {difference}, which the {model.kind} was trained on; give a model of this camera, or"
                 " an environment with the model's"
             )
-        super().__init__(planner, model.frame_gap, **options)
-        if model.action_dim != self.effector.action_dim:
+        effector = effector or Arm()
+        difference = _other_actions(effector, model)
+        if difference is not None:
             raise UsageError(
-                f"the {model.kind} takes actions of {model.action_dim} numbers, those of the"
-                f" {type(self.effector).__name__} have {self.effector.action_dim}; give the effector of its environment"
+                f"the {model.kind} learned from actions {difference}; give the effector of its robot, a"
+                " planning.effectors.Effector: effector=..."
             )
+        super().__init__(planner, model.frame_gap, effector, **options)
         self.model, self.camera = model, camera
         self.context_frames = context_frames
         parameter = next(iter(model.parameters()), None)
         self.device = torch.device("cpu") if parameter is None else parameter.device
 
     def reset(self, observation: Observation, goal: Goal) -> None:
-        super().reset(observation, goal)
+        super().reset(taken_in(observation, self.camera), goal)
         self.frames: deque[Observation] = deque(maxlen=self.context_frames)
         self.designated: deque[torch.Tensor] = deque(maxlen=self.context_frames)
         self.executed: deque[NDArray] = deque(maxlen=self.context_frames - 1)
+
+    def act(self, observation: Observation) -> NDArray[np.float32]:
+        return super().act(taken_in(observation, self.camera))
 
     def decide(self, observation: Observation) -> NDArray:
         self.watch(observation)
@@ -90,8 +99,6 @@ class LearnedController(PlanningController):
 
     def watch(self, observation: Observation) -> None:
         """Take in a frame that the model is to be shown."""
-        if observation["rgb"].dtype != np.uint8:
-            raise UsageError(f"observation['rgb'] is {observation['rgb'].dtype}; give uint8 colours of 0 to 255")
         pixels = self.follower.pixels(observation, self.camera)
         if not self.frames:  # nothing came before: the first frame, standing still
             before = self.context_frames - 1
@@ -129,3 +136,15 @@ class LearnedController(PlanningController):
     def tensor(self, array: NDArray) -> torch.Tensor:
         """Float32, where the model is."""
         return torch.as_tensor(np.asarray(array, np.float32), device=self.device)
+
+
+def _other_actions(effector: Effector, model: Any) -> str | None:
+    """In what the actions that a model learned from are not the effector's, if in anything."""
+    name, context = type(effector).__name__, model.context
+    if model.action_dim != effector.action_dim:
+        return f"of {model.action_dim} numbers, those of the {name} have {effector.action_dim}"
+    if effector.aggregation is not None and tuple(effector.aggregation) != tuple(context.action_aggregation):
+        return f"that add up as {tuple(context.action_aggregation)}, those of the {name} as {effector.aggregation}"
+    if effector.scale is not None and not np.allclose(effector.scale, context.action_scale, rtol=TOLERANCE):
+        return f"in units of {tuple(context.action_scale)}, those of the {name} are in {effector.scale}"
+    return None

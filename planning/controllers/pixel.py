@@ -51,7 +51,8 @@ class PixelController(LearnedController):
         @torch.inference_mode()
         def cost(sequences: NDArray) -> NDArray:
             actions = self.tensor(self.aggregated(sequences))  # (N, h, A)
-            effector = self.pixel(self.effector.path(observation, sequences, self.hold))  # (N, h, 2)
+            if self.reach:
+                effector = self.pixel(self.effector.path(observation, sequences, self.hold))  # (N, h, 2)
             future, track = state, start
             distances = []
             for step in range(actions.shape[1]):

@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from data_collection.files import written_aside
 from envs.command import run
 from envs.errors import UsageError
+from envs.files import written_aside
 from tests.benchmarks.child import BenchmarkFailed
 from tests.benchmarks.machine import facts
 from tests.benchmarks.result import Result, table

@@ -16,12 +16,13 @@ from data_collection.collect import Config, main
 from data_collection.dataset import RGBDDataset
 from data_collection.environments import versions
 from data_collection.episodes import EpisodeMaker
-from data_collection.files import locked
 from data_collection.manifest import Manifest
 from data_collection.policies.random import RandomPolicy
 from data_collection.repair import find_damage
 from data_collection.rollout import collect_episode
+from data_collection.workers import Worker
 from envs.errors import UsageError
+from envs.files import locked
 
 
 def test_episodes_are_as_the_environment_gave_them(collected):
@@ -113,6 +114,23 @@ def test_failing_worker_is_named_and_replaced_and_costs_one_episode(collected, t
     assert len(lost) == 1 and "worker " in lost[0] and "pid " in lost[0], err
     assert "lost episode 2: " in lost[0] and said in lost[0]
     assert RGBDDataset(tmp_path / "data").content_hash == RGBDDataset(collected).content_hash
+
+
+class Silent(Worker):
+    """Says nothing."""
+
+    def news(self):
+        return None
+
+    def stop(self):
+        pass
+
+
+def test_a_worker_that_hangs_is_told_with_the_time_it_had():
+    worker = Silent("worker 0", 8.0, 0)
+    assert worker.hung() == ("failed", "hung: it was not ready in 300 s")
+    worker.begin(1)
+    assert worker.hung() == ("failed", "hung: the episode was not done in 8 s")
 
 
 def test_episode_that_always_fails_stops_the_run(tmp_path):

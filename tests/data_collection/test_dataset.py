@@ -9,14 +9,12 @@ import shutil
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from shards import ATTRS, CAMERA, flip_a_byte_of, make_episode
 from torch.utils.data import DataLoader
 
 from data_collection import writer
 from data_collection.dataset import RGBDDataset
-from data_collection.schema import DEPTH_STEPS, DamagedShard, dequantise_depth, episode_hash, quantise_depth, read_shard
+from data_collection.schema import DamagedShard, episode_hash, read_shard
 from data_collection.writer import intact_episodes, read_episode, write_shard
 from envs.errors import UsageError
 
@@ -60,23 +58,6 @@ def test_ground_truth_is_seen_only_if_all_shards_have_it(tmp_path):
     assert not RGBDDataset(tmp_path).has_ground_truth
     with pytest.raises(UsageError, match=r"shard-00001.h5 has no column 'segmentation'.*--ground-truth"):
         RGBDDataset(tmp_path, ["rgb", "segmentation"])
-
-
-@given(st.lists(st.floats(0.5, 6.0), min_size=1), st.floats(0.5, 2.0), st.floats(0.01, 4.0))
-def test_depth_comes_back_to_half_a_step(metres, near, span):
-    far = near + span
-    depth = np.array(metres, np.float32)
-    back = dequantise_depth(quantise_depth(depth, near, far), near, far)
-    assert back.dtype == np.float32
-    half_step = span / DEPTH_STEPS / 2
-    np.testing.assert_allclose(back, np.clip(depth, near, far), atol=half_step + 1e-6, rtol=0)
-
-
-def test_depth_with_holes_is_refused_and_what_is_too_near_or_far_is_clipped():
-    with pytest.raises(UsageError, match="depth has NaN in 2 of 6 pixels; fill such holes"):
-        quantise_depth(np.array([[1.0, np.nan, 2.0], [np.nan, 1.0, 1.0]], np.float32), 0.5, 3.0)
-    clipped = quantise_depth(np.array([0.0, 0.5, 3.0, np.inf]), 0.5, 3.0)
-    assert clipped.tolist() == [0, 0, DEPTH_STEPS, DEPTH_STEPS]
 
 
 def test_a_dataset_is_a_sequence_of_episodes(folder):
@@ -161,6 +142,22 @@ def _drop_table(path):
         del file["ep_len"]
 
 
+def _shorten_table(name):
+    def damage(path):
+        with h5py.File(path, "a") as file:
+            values = file[name][()]
+            del file[name]
+            file[name] = values[..., :-1]
+
+    return damage
+
+
+def _make_a_group_of_a_column(path):
+    with h5py.File(path, "a") as file:
+        del file["state"]
+        file.create_group("state")
+
+
 def _shorten_column(path):
     with h5py.File(path, "a") as file:
         values = file["reward"][:-1]
@@ -183,6 +180,8 @@ def _retype_column(path):
         _empty,
         _spoil_attribute,
         _drop_table,
+        *map(_shorten_table, ("ep_len", "ep_index", "ep_hash")),
+        _make_a_group_of_a_column,
         _shorten_column,
         _retype_column,
     ],
@@ -252,6 +251,30 @@ def test_shards_of_different_datasets(folder, episodes):
         RGBDDataset(folder)
 
 
+def test_shards_whose_optional_columns_differ(tmp_path):
+    rng = np.random.default_rng(0)
+    for number, bodies in enumerate((3, 2)):
+        episode = make_episode(rng, 4, ground_truth=True)
+        episode["body_pose"] = episode["body_pose"][:, :bodies]
+        write_shard(tmp_path / f"shard-0000{number}.h5", [episode], ATTRS, [number])
+    with pytest.raises(UsageError, match=r"column 'body_pose' has rows of \(2, 7\) in .*1\.h5 but \(3, 7\)"):
+        RGBDDataset(tmp_path)
+
+
+def test_what_else_is_in_a_shard_is_left_alone(folder, episodes):
+    before = RGBDDataset(folder)
+    with h5py.File(folder / "shard-00000.h5", "a") as file:
+        file["notes/operator"] = np.arange(3)
+        file["ep_language"] = ["push", "pull"]
+        file.attrs["operator"], file.attrs["offset"] = "Anna", np.arange(3.0)
+        file.attrs["tags"], file.attrs["nothing"] = [b"a", b"b"], h5py.Empty("f4")
+    after = RGBDDataset(folder)
+    assert after.columns == before.columns and after.content_hash == before.content_hash
+    assert after.attrs["operator"] == "Anna" and after.attrs["offset"].tolist() == [0, 1, 2]
+    assert intact_episodes(folder / "shard-00000.h5")[1] == [True, True]
+    np.testing.assert_array_equal(after.episode(1)["rgb"], episodes[1]["rgb"])
+
+
 def test_how_episodes_ended_is_kept_and_is_no_part_of_the_content(folder, episodes):
     before = RGBDDataset(folder)
     assert before.episode_terminated.tolist() == [False] * 3  # without the table none did
@@ -262,7 +285,7 @@ def test_how_episodes_ended_is_kept_and_is_no_part_of_the_content(folder, episod
     with h5py.File(folder / "shard-00000.h5", "a") as file:
         del file["ep_terminated"]
         file["ep_terminated"] = np.zeros(3, np.uint8)
-    with pytest.raises(DamagedShard, match=r"ep_terminated is \(3,\), for 2 episodes"):
+    with pytest.raises(DamagedShard, match=r"ep_terminated is uint8 \(3,\), for 2 episodes"):
         RGBDDataset(folder)
 
 
@@ -274,11 +297,19 @@ def test_writer_refuses_what_the_schema_does_not_have(tmp_path, episodes):
         lambda columns: columns.update(depth=columns["depth"].astype(np.float32)),
         lambda columns: columns.update(reward=columns["reward"][:-1]),
         lambda columns: columns.update(reward=columns["reward"] * np.nan),
+        lambda columns: columns.update({name: values[:0] for name, values in columns.items()}),
     ):
         columns = dict(episodes[0])
         spoil(columns)
         with pytest.raises(ValueError):
             write_shard(path, [columns], ATTRS, [0])
+    for chosen, numbers, ended, words in (
+        ([], [], (), "no episodes for shard-00000.h5"),
+        (episodes, [0, 1], (), "ep_index has 2 for 3 episodes; give one for each"),
+        (episodes, [0, 1, 2], [True], "ep_terminated has 1 for 3 episodes"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            write_shard(path, chosen, ATTRS, numbers, ended)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -286,7 +317,7 @@ def test_shard_is_replaced_or_left(folder, episodes, monkeypatch):
     """A writer that fails half-way leaves the shard that was there, and no other file."""
     path = folder / "shard-00001.h5"
     before = path.read_bytes()
-    monkeypatch.setattr("data_collection.files.os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    monkeypatch.setattr("envs.files.os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
         write_shard(path, episodes, ATTRS, [0, 1, 2])
     assert path.read_bytes() == before and not list(folder.glob("*.tmp"))

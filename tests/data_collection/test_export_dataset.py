@@ -17,7 +17,7 @@ from data_collection.writer import write_shard
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data")
     rng = np.random.default_rng(0)
-    attrs = {**ATTRS, "env_id": "calvin/D"}
+    attrs = {**ATTRS, "env_id": "calvin/D", "workspace": [[0.0] * 3, [1.0] * 3], "offset": np.arange(2.0)}
 
     def episode(rows):
         turned = rng.normal(size=(rows, 3)).astype(np.float32)
@@ -39,7 +39,8 @@ def test_minari_opens_the_export(folder, tmp_path, monkeypatch):
     assert theirs.total_episodes == 3 and theirs.total_steps == 4 + 2 + 7
     metadata = theirs.storage.metadata
     assert metadata["author"] == {"A. Person"} and metadata["rgbd"]["camera"]["K"] == CAMERA.K.tolist()
-    assert metadata["rgbd"]["action_aggregation"] == ["sum", "last"]
+    assert metadata["rgbd"]["action_aggregation"] == ["sum", "last"] and metadata["rgbd"]["seed"] == ATTRS["seed"]
+    assert metadata["rgbd"]["workspace"] == [[0, 0, 0], [1, 1, 1]] and metadata["rgbd"]["offset"] == [0, 1]
     for number, episode in enumerate(theirs.iterate_episodes()):
         expected = ours.episode(number)
         np.testing.assert_array_equal(episode.observations["rgb"].transpose(0, 2, 3, 1), expected["rgb"])

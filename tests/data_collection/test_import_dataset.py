@@ -79,6 +79,9 @@ def test_other_options_or_another_source_are_refused(source, imported, tmp_path)
     np.save(tmp_path / "ids.npy", np.array([[22, 32], [0, 10]]))
     result = call("import-dataset", arguments(source, imported, ids=tmp_path / "ids.npy"))
     assert_one_line_error(result, "shard-00000.h5", "frames 22 to 27")
+    np.save(tmp_path / "ids.npy", np.array([[0, 10], [11, 21], [22, 32]]))  # the last episode is gone
+    result = call("import-dataset", arguments(source, imported, ids=tmp_path / "ids.npy"))
+    assert_one_line_error(result, "shard-00006.h5 holds episode 3", "past its 6 episodes", "the same source")
     assert_one_line_error(call("import-dataset", arguments(source, tmp_path / "ids.npy")), "is a file")
     for option, value in (("image-size", 4), ("steps", 0), ("limit", 0), ("near", -1), ("depth-scale", "nan")):
         result = call("import-dataset", arguments(source, tmp_path / "new", **{option: value}))

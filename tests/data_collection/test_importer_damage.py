@@ -105,16 +105,19 @@ def test_wrong_units_of_calvin_depth(tmp_path, change, words):
 
 
 def test_notes_on_calvin_actions(tmp_path):
-    folder = write_calvin(tmp_path / "task_D_D", [(0, 9), (10, 19), (20, 29)])
+    folder = write_calvin(tmp_path / "task_D_D", [(0, 9), (10, 19), (20, 29), (30, 39)])
     for number in range(10, 20):
         change_frame(folder, number, rel_actions=np.r_[0.004, 0, 0, 0, 0, 0, 1])  # metres
     change_frame(folder, 21, robot_obs=np.r_[ROBOT[:14], 0.0])
     change_frame(folder, 22, rel_actions=np.r_[0.2, 0, 0, 0, 0, -3, 1])
+    for number in range(30, 33):
+        change_frame(folder, number, rel_actions=np.r_[0.2, 0, 0, 0, 0, -1, 1])
     report = report_of("calvin", folder, tmp_path / "data")
     assert report[0] == ("imported", "")
     assert report[1][0] == "imported" and "moves the arm by 1 m, not by 0.02 m" in report[1][1]
     assert report[2][0] == "imported" and "relative actions up to 3" in report[2][1]
     assert "robot_obs has the gripper at 0 (1 of 10)" in report[2][1]
+    assert report[3][0] == "imported" and "33% of the relative actions are clipped to -1 or 1" in report[3][1]
 
 
 def test_damaged_dexhand(tmp_path):

@@ -104,7 +104,7 @@ def test_calvin_actions_add_up_over_a_gap(calvin, tmp_path):
     dataset = imported("calvin", calvin, tmp_path / "data", "--image-size", "8")
     actions = dataset.episode(0)["action"][3:6].astype(float)
     total = aggregate_actions(actions, dataset.attrs["action_aggregation"], dataset.attrs["action_scale"])
-    place, angles = np.zeros(3), np.zeros(3)  # of the target, which calvin_env moves so
+    place, angles = np.zeros(3), np.zeros(3)  # of the hand: differences from frame to frame
     for action in actions:
         place, angles = place + 0.02 * action[:3], angles + 0.05 * action[3:6]
     np.testing.assert_allclose(0.02 * total[:3], place, atol=1e-9)

@@ -14,15 +14,15 @@ from layouts import write_omnipush
 from shards import ATTRS, flip_a_byte_of, make_episode
 
 from data_collection.dataset import RGBDDataset
-from data_collection.files import locked
 from data_collection.goal_statistics import goal_statistics
 from data_collection.pictures import write_film
 from data_collection.repair import find_damage, repair
 from data_collection.schema import episode_hash
-from data_collection.statistics import BY_NUMBER, column_ranges, moved_shares, workspace_coverage
+from data_collection.statistics import BY_NUMBER, column_ranges, describe, moved_shares, workspace_coverage
 from data_collection.writer import write_shard
 from envs.dexhand.goals import HOME
 from envs.errors import UsageError
+from envs.files import locked
 
 
 @pytest.fixture
@@ -129,6 +129,60 @@ def test_intact_episodes_of_a_damaged_shard_are_kept(tmp_path):
     np.testing.assert_array_equal(episode_hash(dataset.episode(0)), episode_hash(episodes[1]))
 
 
+@pytest.fixture
+def half_damaged(tmp_path):
+    """A shard whose first episode is damaged, with what somebody has added to it."""
+    rng = np.random.default_rng(0)
+    path = tmp_path / "shard-00000.h5"
+    write_shard(path, [make_episode(rng, 1000), make_episode(rng, 1000)], ATTRS, [4, 5])
+    with h5py.File(path, "a") as file:
+        file["notes/of_mine"] = np.arange(2)
+        file["ep_language"] = ["push", "pull"]
+        file.attrs["offset"], file.attrs["operator"] = np.arange(3.0), "Anna"
+    flip_a_byte_of(path, "rgb")
+    return path
+
+
+def test_repair_of_a_shard_with_more_than_ours(half_damaged):
+    kept = half_damaged.read_bytes()
+    repair(half_damaged.parent)
+    dataset = RGBDDataset(half_damaged.parent)
+    assert dataset.episode_indices.tolist() == [5] and not find_damage(half_damaged.parent)
+    assert dataset.attrs["offset"].tolist() == [0, 1, 2] and dataset.attrs["operator"] == "Anna"
+    assert (half_damaged.parent / "damaged" / half_damaged.name).read_bytes() == kept
+    with h5py.File(half_damaged, "r") as file:
+        assert "notes" not in file and "ep_language" not in file
+
+
+@pytest.mark.parametrize(
+    "step", ["data_collection.repair.write_shard", "data_collection.repair._copy_aside", "envs.files.os.replace"]
+)
+def test_a_repair_that_fails_or_is_killed_loses_nothing(half_damaged, monkeypatch, step):
+    before = half_damaged.read_bytes()
+
+    def fail(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(step, fail)
+        repair(half_damaged.parent)
+    assert half_damaged.read_bytes() == before and not list(half_damaged.parent.glob("*.tmp"))
+    repair(half_damaged.parent)
+    assert RGBDDataset(half_damaged.parent).episode_indices.tolist() == [5]
+
+
+def test_repair_without_hard_links_copies(half_damaged, monkeypatch):
+    before = half_damaged.read_bytes()
+
+    def refuse(*_):
+        raise OSError("no hard links here")
+
+    monkeypatch.setattr("os.link", refuse)
+    repair(half_damaged.parent)
+    assert (half_damaged.parent / "damaged" / half_damaged.name).read_bytes() == before
+    assert RGBDDataset(half_damaged.parent).episode_indices.tolist() == [5]
+
+
 def test_repair_leaves_a_shard_alone_that_another_program_has_open(folder):
     before = sorted(folder.iterdir())
     with h5py.File(folder / "shard-00001.h5", "r+"):
@@ -200,21 +254,33 @@ def test_workspace_coverage_of_known_positions():
     assert half["share_of_cells_visited"] == 0.25 and half["share_of_frames_inside"] == 0.5
 
 
+def test_anothers_dataset_is_described_without_what_is_only_known_of_ours(tmp_path):
+    episode = make_episode(np.random.default_rng(0), 4)
+    episode["scene_obs"] = np.zeros((4, 3), np.float32)
+    for number, env_id in enumerate(("lab/TabletopSort-v0", "lab/DexHandover-v0")):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        attrs = {**ATTRS, "env_id": env_id, "workspace": [0.3, 0.4]}
+        write_shard(folder / "shard-00000.h5", [episode], attrs, [0])
+        assert not {"workspace", "moved", "goals"} & describe(RGBDDataset(folder)).keys()
+
+
 def test_goals_of_a_hand_are_counted_where_they_change():
     def pose(degrees):
         half = np.radians(degrees) / 2
         return [*HOME, np.cos(half), 0, 0, np.sin(half)]
 
-    rows = [(0, 60), (40, 60), (55, 60), (55, 100), (70, 100)]  # cube and goal, degrees: one reached, one not
+    rows = [(0, 60), (40, 60), (55, 60)]  # cube and goal, degrees: reached, and the next goal is given
+    rows += [(70, 100), (92, 100), (80, 20), (70, 20)]  # reached in two steps; the third goal is not
     rows += [(0, 30), (10, 30)]  # the next episode
     scene_obs = np.array([pose(cube) + pose(goal) for cube, goal in rows], np.float32)
     scene_obs[-1, 2] = 0.05  # dropped
-    found = goal_statistics(scene_obs, np.array([[0, 5], [5, 7]]))
+    found = goal_statistics(scene_obs, np.array([[0, 7], [7, 9]]))
     assert found == {
-        "given": 3,
-        "reached": 0.3333,
+        "given": 4,
+        "reached": 0.5,
         "median_steps_to_reach": 2.0,
-        "median_degrees_at_start": 45.0,
-        "median_degrees_at_end": 20.0,
+        "median_degrees_at_start": 52.5,  # 60, 45, 72, 30
+        "median_degrees_at_end": 14.0,  # 5, 8, 50, 20
         "episodes_dropped": 0.5,
     }

@@ -10,12 +10,12 @@ from commands import HERE, assert_one_line_error, call, finish, options, start
 from standin import reset_seed
 
 from data_collection.collect import Config
-from data_collection.files import locked
 from data_collection.process_workers import ProcessPool
 from data_collection.ray_cluster import QUIET, connect
 from data_collection.ray_workers import Collector, RayPool
 from data_collection.repair import find_damage
 from data_collection.workers import Collected, WorkerLost, collect_episodes
+from envs.files import locked
 from tests.ray_nodes import started_nodes
 
 ROOT = HERE.parent.parent

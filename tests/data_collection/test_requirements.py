@@ -6,7 +6,8 @@ import pytest
 from commands import assert_one_line_error, call, options
 from standin import StandIn
 
-from data_collection.environments import make_env
+from data_collection import environments, train_policy
+from data_collection.environments import KNOWN_ENVS, describe_env, known_env, make_env, versions
 from data_collection.policies.random import RandomPolicy
 from data_collection.rollout import collect_episode
 from envs.errors import UsageError
@@ -46,12 +47,61 @@ gymnasium.register(ID, entry_point=Odd)
         ({"acts": BOX(-1, 1, (2,), np.float32)}, "has ACTION_AGGREGATION .*one for each of the 2 numbers"),
         ({"ACTION_SCALE": (1.0,)}, r"has ACTION_SCALE \(1.0,\); it must have one for each of the 3 numbers"),
         ({"camera": "static"}, "has a str as camera"),
+        ({"workspace": np.ones(3)}, r"workspace of shape \(3,\); make it \(2, 3\).*or leave it out"),
         ({"body_names": ["part"] * 257}, "257 bodies.*256; leave out --ground-truth"),
     ],
 )
 def test_what_a_dataset_does_not_store_is_refused_before_an_episode(odd, words):
     with pytest.raises(UsageError, match=words):
         make_env(ID, odd, ground_truth=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "ours"),
+    [
+        ("planar-push", "planar-push"),
+        ("t3vip/TabletopD-v0", "tabletop"),
+        ("envs:t3vip/DexHand-v0", "dexhand"),
+        ("lab/TabletopSort-v0", None),
+        ("t3vip/TabletopSort-v0", None),
+        ("lab:other-t3vip/DexHand-v0", None),
+        ("t3vip/PlanarPush-v0.1", None),
+    ],
+)
+def test_an_environment_is_ours_only_by_its_whole_id(name, ours):
+    assert known_env(name) is (KNOWN_ENVS[ours] if ours else None)
+
+
+def test_the_versions_of_all_that_makes_scenes_are_told():
+    told = versions()
+    assert all(told.values()) and {"gymnasium-robotics", "dm_control", "scipy", "fast-simplification"} <= set(told)
+
+
+def test_what_draws_anothers_pictures_is_what_it_says(monkeypatch):
+    def refuse():
+        raise UsageError("no OpenGL works")
+
+    monkeypatch.setattr(environments, "gl_renderer", refuse)
+    assert describe_env(make_env(ID, {"gl_renderer": "a printer"}, False), ID, {})["gl_renderer"] == "a printer"
+    monkeypatch.delattr(StandIn, "gl_renderer")
+    assert describe_env(make_env(ID, {}, False), ID, {})["gl_renderer"] == "unknown"
+
+
+class Goals(gymnasium.Env):
+    """Another's environment with goals, which knows no keyword `images`."""
+
+    action_space = BOX(-1, 1, (2,))
+
+    def compute_reward(self, achieved, desired, info):
+        return -1.0
+
+
+gymnasium.register("requirements/Goals-v0", entry_point=Goals, max_episode_steps=10)
+
+
+def test_policies_are_trained_in_others_environments_too(tmp_path):
+    env = train_policy._make_env(train_policy.Config(tmp_path / "new.zip", env="requirements/Goals-v0"))
+    assert isinstance(env.unwrapped, Goals)
 
 
 def test_256_bodies_will_do_and_more_without_ground_truth():

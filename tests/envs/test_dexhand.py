@@ -54,6 +54,11 @@ def test_render_modes_agree_with_observations():
             np.testing.assert_array_equal(rgb, observation["rgb"])
         if depth is not None:
             np.testing.assert_array_equal(depth, observation["depth"])
+        for image in (rgb, depth):
+            if image is not None:  # drawing on it changes no other picture
+                image[:] = 0
+        np.testing.assert_array_equal(env.observation()["rgb"], observation["rgb"])
+        np.testing.assert_array_equal(env.observation()["depth"], observation["depth"])
         env.close()
 
 
@@ -137,6 +142,8 @@ def test_a_new_goal_follows_one_that_is_reached_also_after_restoring():
     np.testing.assert_array_equal(info["scene_obs"][7:10], goals.HOME)
     np.testing.assert_allclose(goals.rotation_distance(info["scene_obs"][10:], info["scene_obs"][3:7]), 0, atol=0.2)
     assert goals.rotation_distance(observation["desired_goal"][3:], observation["achieved_goal"][3:]) > 0.2
+    (shown,) = np.flatnonzero(env.mj_model.body_mocapid == 0)
+    np.testing.assert_allclose(env.body_poses()[shown], env.goal)
     env.set_state(state)
     np.testing.assert_array_equal(env.step(hold)[0]["desired_goal"], observation["desired_goal"])
     assert env.step(hold)[4]["goals_reached"] == 1

@@ -10,7 +10,8 @@ from planning.controllers.base import HoldingController, PlanningController
 from planning.controllers.baselines import LinearController, ProportionalController, RandomController
 from planning.controllers.pixel import PixelController
 from planning.controllers.t3vip import T3VIPController
-from planning.effectors import Tip
+from planning.costs import Reach
+from planning.effectors import Arm, Effector, Tip
 from planning.icem import ICEM, ICEMConfig
 
 
@@ -141,23 +142,115 @@ def test_a_camera_may_stand_elsewhere(exact_model, camera):
 
 def test_a_model_of_other_actions_than_the_effectors_is_refused(exact_model, camera):
     search = ICEM(ICEMConfig(), -0.5 * np.ones(2), 0.5 * np.ones(2), np.random.default_rng(0))
-    with pytest.raises(UsageError, match="the t3vip takes actions of 7 numbers, those of the Tip have 3; give the eff"):
+    with pytest.raises(UsageError, match="from actions of 7 numbers, those of the Tip have 3; give the effector of"):
         T3VIPController(exact_model, camera, search, effector=Tip())
+    exact_model.context.action_aggregation = ("sum",) * 7
+    with pytest.raises(UsageError, match=r"actions that add up as \('sum'.*, those of the Arm as .*'rotate'"):
+        T3VIPController(exact_model, camera, planner())
+    exact_model.context.action_aggregation = Arm.aggregation
+    exact_model.context.action_scale = (0.01,) * 7
+    with pytest.raises(UsageError, match=r"actions in units of \(0.01, .*, those of the Arm are in \(0.02,"):
+        T3VIPController(exact_model, camera, planner())
 
 
-def test_colours_must_be_as_the_environments_give_them(exact_model, camera, world, goal):
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda o: {"rgb": o["rgb"] / np.float32(255)}, r"\['rgb'\] is float32; give uint8 colours of 0 to 255"),
+        (lambda o: {"rgb": np.zeros((64, 64, 4), np.uint8)}, r"\['rgb'\] has shape \(64, 64, 4\); give \(64, 64, 3\)"),
+        (lambda o: {"depth": o["depth"][:48]}, r"\['depth'\] has shape \(48, 64\); give \(64, 64\)"),
+        (lambda o: {"depth": np.where(np.eye(64) > 0, np.nan, o["depth"])}, "depth has NaN in 64 of 4096 pixels; fill"),
+        (lambda o: {"depth": (1000 * o["depth"]).astype(np.uint16)}, "depth is uint16; give metres as floats"),
+        (lambda o: {"depth": 1000 * o["depth"]}, "most of the depth is about .*; give metres"),
+        (lambda o: {"proprio": o["proprio"] * np.nan}, r"\['proprio'\] is \[nan.*; give finite numbers"),
+        (
+            lambda o: {"proprio": o["proprio"][:2]},
+            r"proprio has shape \(2,\), that of the tabletop's Arm \(15,\); give",
+        ),
+    ],
+)
+def test_a_model_is_shown_only_what_it_learned_from(exact_model, camera, world, goal, change, words):
+    controller = T3VIPController(exact_model, camera, planner())
+    observation = world.observation()
+    with pytest.raises(UsageError, match=words):
+        controller.reset(observation | change(observation), goal)
+    if "Arm" not in words:  # it reads its numbers at the start
+        controller.reset(observation, goal)
+        with pytest.raises(UsageError, match=words):
+            controller.act(observation | change(observation))
+    with pytest.raises(UsageError, match="the observation has no 'depth', only rgb, proprio; give"):
+        controller.reset({name: value for name, value in observation.items() if name != "depth"}, goal)
+
+
+def test_frames_are_clipped_to_the_cameras_range_and_kept_as_they_were(exact_model, camera, world, goal):
+    controller = T3VIPController(exact_model, camera, planner(), context_frames=2)
+    buffers = world.observation()
+    buffers["depth"][0, :2] = [np.inf, 0.0]
+    controller.reset(buffers, goal)
+    for step in range(4):  # the driver writes each frame where the last one is
+        controller.act(buffers)
+        buffers["rgb"][:] = step + 1
+    rgb, depth, _ = exact_model.shown[-1]
+    np.testing.assert_allclose(255 * rgb[0, :, 0, 0, 0], [0, 3], atol=1e-4)
+    np.testing.assert_allclose(depth[0, :, 0, 0, :2], [[camera.far, camera.near]] * 2)
+
+
+def test_the_action_that_is_held_is_the_controllers_own(exact_model, camera, world, goal):
     controller = T3VIPController(exact_model, camera, planner())
     controller.reset(world.observation(), goal)
-    observation = world.observation()
-    with pytest.raises(UsageError, match=r"observation\['rgb'\] is float32; give uint8 colours of 0 to 255"):
-        controller.act({**observation, "rgb": observation["rgb"].astype(np.float32) / 255})
+    first = controller.act(world.observation())
+    sent = first.copy()
+    first *= 0.1  # to the units of some robot
+    np.testing.assert_array_equal(controller.act(world.observation()), sent)
+
+
+class Joints(Effector):
+    """Six numbers that go nowhere in particular; an action is a move and a zero."""
+
+    axes, action_dim, limit = 6, 7, 1.0
+
+    def position(self, observation):
+        return observation["proprio"][:3]
+
+    def action(self, move):
+        return np.concatenate([move, np.zeros((*np.shape(move)[:-1], 1))], axis=-1).astype(np.float32)
+
+
+def test_a_model_plans_moves_of_any_kind(exact_model, pixel_model, camera, world, goal):
+    search = ICEM(ICEMConfig(), -np.ones(6), np.ones(6), np.random.default_rng(0))
+    far = np.linalg.norm(goal.pixel - camera.project(camera.to_camera(world.tcp)))
+    servo(PixelController(pixel_model, camera, search, effector=Joints()), world, goal)
+    assert np.linalg.norm(goal.pixel - camera.project(camera.to_camera(world.tcp))) < 0.2 * far
+    assert servo(T3VIPController(exact_model, camera, search, effector=Joints()), world, goal)[-1] < 0.03
+    for refused in (
+        lambda: ProportionalController(Joints()),
+        lambda: LinearController(search, 3, Joints()),
+        lambda: T3VIPController(exact_model, camera, search, effector=Joints(), reach=Reach(0.5, 0.1)),
+    ):
+        with pytest.raises(UsageError, match="a move of the Joints is 6 numbers, not along x and y"):
+            refused()
+
+
+def test_an_effector_makes_an_action_of_each_move(exact_model, camera, world, goal):
+    class Single(Joints):
+        def action(self, move):
+            return np.zeros(7, np.float32)
+
+    search = ICEM(ICEMConfig(), -np.ones(6), np.ones(6), np.random.default_rng(0))
+    controller = T3VIPController(exact_model, camera, search, effector=Single())
+    with pytest.raises(
+        UsageError, match=r"Single.action makes actions \(7,\) of moves \(2, 4, 6\); make it \(2, 4, 7\)"
+    ):
+        controller.reset(world.observation(), goal)
 
 
 def test_a_goal_must_be_a_place_that_the_controller_can_know(exact_model, pixel_model, camera, world, goal):
     nowhere, unseen = replace(goal, point_world=np.full(3, np.nan)), replace(goal, pixel=np.array([np.inf, 3.0]))
     spatial = T3VIPController(exact_model, camera, planner())
-    with pytest.raises(UsageError, match=r"the goal's point_world is \[nan, nan, nan\]; give finite numbers"):
+    with pytest.raises(UsageError, match=r"the goal's point_world is \[nan, nan, nan\]; give 3 finite numbers"):
         spatial.reset(world.observation(), nowhere)
+    with pytest.raises(UsageError, match=r"the goal's point_world is \[0.0, 0.0\]; give 3 finite numbers"):
+        spatial.reset(world.observation(), replace(goal, point_world=np.zeros(2)))
     spatial.reset(world.observation(), unseen)
     flat = PixelController(pixel_model, camera, planner())
     with pytest.raises(UsageError, match=r"the goal's pixel is \[inf, 3.0\]"):
@@ -173,7 +266,7 @@ def test_a_model_is_shown_a_frame_at_least(exact_model, camera, frames):
 
 def test_an_episode_begins_with_reset(world):
     with pytest.raises(UsageError, match=r"act\(\) before reset\(\).*call reset first"):
-        ProportionalController(3).act(world.observation())
+        ProportionalController().act(world.observation())
 
 
 def test_holding_is_an_interface():
@@ -190,4 +283,4 @@ def test_plans_without_a_finite_cost_are_told(world, goal):
     controller.reset(world.observation(), goal)
     with pytest.warns(RuntimeWarning, match="Blind found no move of finite cost"):
         action = controller.act(world.observation())
-    assert np.isfinite(action).all()
+    np.testing.assert_array_equal(action, [0, 0, 0, 0, 0, 0, -1])  # it stands still

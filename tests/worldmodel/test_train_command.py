@@ -13,8 +13,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from data_collection.files import locked
 from envs.command import run
+from envs.files import locked
 from envs.planar_push.objects import SPLITS
 from worldmodel import devices
 from worldmodel.checkpoint import load_model

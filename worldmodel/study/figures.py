@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from data_collection.files import written_aside
+from envs.files import written_aside
 from worldmodel.evaluation_report import ARROWS
 from worldmodel.scores import SCORES, Score
 from worldmodel.study.paper import METRICS

@@ -6,8 +6,8 @@ import json
 from typing import Any
 
 from data_collection.dataset import RGBDDataset
-from data_collection.files import write_json
 from envs.errors import UsageError
+from envs.files import write_json
 from worldmodel import evaluate, perceptual_weights
 from worldmodel.checkpoint import content_hashes
 from worldmodel.perceptual import SMALLEST

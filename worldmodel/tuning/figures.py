@@ -11,7 +11,7 @@ from matplotlib import colormaps
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from data_collection.files import written_aside
+from envs.files import written_aside
 from worldmodel.tuning.correlation import written
 
 Document = dict[str, Any]

@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from data_collection.files import write_json, written_aside
 from envs.errors import UsageError
+from envs.files import write_json, written_aside
 from worldmodel.tuning import journal
 from worldmodel.tuning.correlation import FEWEST, rank_correlations, written
 from worldmodel.tuning.figures import draw_correlations, draw_trials

@@ -8,9 +8,9 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from data_collection.files import write_json
 from data_collection.ray_cluster import connect
 from envs.errors import UsageError
+from envs.files import write_json
 from worldmodel.clips import ClipSource
 from worldmodel.held_out import ValidationSet
 from worldmodel.train import HOW_NOT_WHAT, changes, document_of

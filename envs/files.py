@@ -23,8 +23,12 @@ def written_aside(path: Path) -> Iterator[Path]:
     """Give the path of a temporary file that takes the place of `path` when the block ends well.
 
     The temporary name, NAME.<pid>.tmp, carries the process id, so that two processes never write into the same file. An
-    exception in the block removes it; what a killed process leaves, `remove_leftovers` clears.
+    exception in the block removes it; what a killed process leaves, `remove_leftovers` clears. What is no file, such as
+    /dev/stdout, has no other to take its place: it is written to itself.
     """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        yield path
+        return
     aside = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
         yield aside
