@@ -25,18 +25,17 @@ def discounted_distance(distances: NDArray, discount: float = 0.95) -> NDArray[n
     return np.asarray(distances, np.float64) @ discount ** np.arange(distances.shape[-1])
 
 
-def env_action(move: NDArray, gripper: float, dim: int = 7) -> NDArray[np.float32]:
+def env_action(move: NDArray, gripper: float) -> NDArray[np.float32]:
     """A translation as an action of the arm: no rotation, gripper held.
 
     Args:
         move: (..., 3), x, y, z in [-1, 1].
         gripper: the gripper's command, -1 or 1, kept as it is.
-        dim: numbers in an action; the translation comes first, the gripper last.
 
     Returns:
-        actions: (..., dim) float32.
+        actions: (..., 7) float32: the translation comes first, the gripper last.
     """
-    action = np.zeros((*np.shape(move)[:-1], dim), np.float32)
+    action = np.zeros((*np.shape(move)[:-1], 7), np.float32)
     action[..., :3] = move
     action[..., -1] = gripper
     return action

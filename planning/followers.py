@@ -14,7 +14,7 @@ from envs.errors import UsageError
 from planning.effectors import Effector, Observation
 from planning.goals import Goal
 from planning.point_tracker import PointTracker
-from worldmodel.tracking import HAND_RADIUS, HandTrack, SurfaceTrack, Track, hand_pixels
+from worldmodel.tracking import HandTrack, SurfaceTrack, Track, hand_pixels
 
 Array = NDArray[np.float64]
 
@@ -67,11 +67,10 @@ class EffectorFollower(Follower):
 
     Args:
         effector: whose.
-        radius: metres around the point that are taken for the end-effector.
     """
 
-    def __init__(self, effector: Effector, radius: float = HAND_RADIUS) -> None:
-        self.effector, self.radius = effector, radius
+    def __init__(self, effector: Effector) -> None:
+        self.effector = effector
 
     def reset(self, observation: Observation, goal: Goal) -> None:
         if goal.designated is not None:
@@ -84,11 +83,11 @@ class EffectorFollower(Follower):
     def pixels(self, observation: Observation, camera: CameraModel) -> torch.Tensor:
         seen = torch.as_tensor(camera.unproject(observation["depth"]).astype(np.float32)).permute(2, 0, 1)
         tcp = camera.to_camera(self.effector.position(observation)).astype(np.float32)
-        return hand_pixels(seen, torch.as_tensor(tcp), self.radius)
+        return hand_pixels(seen, torch.as_tensor(tcp))
 
     @staticmethod
     def track(body: torch.Tensor, point: torch.Tensor, K: torch.Tensor, futures: int) -> Track:
-        return HandTrack(point.expand(futures, 3), body.expand(futures, *body.shape), K)
+        return HandTrack.start(body, point, K, futures)
 
 
 class SurfaceFollower(Follower):

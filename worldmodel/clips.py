@@ -28,6 +28,8 @@ outcome."""
 FOLLOWING_SECONDS = 0.13
 """Time constant of that follower, chosen on DexHand. A linear map of where it goes explains 82 % of the variance of the
 joints' motion in a control step, 84 % in three; one of the commands' changes 53 and 58 % (`action_columns.py`)."""
+SAMPLED_ACTIONS = 4096
+"""Actions of which the statistics are taken."""
 HELD = ("rgb", "depth")
 """What is held in memory where it fits."""
 PICTURES = (*HELD, "segmentation")
@@ -163,6 +165,16 @@ class ClipSource:
         self._hold((action_column, *HELD) if self.in_memory else (action_column,))
         self.action_dim = int(self._columns[action_column].shape[1])
 
+    @property
+    def control_rate(self) -> float:
+        """Control steps a second."""
+        return float(self.dataset.attrs["control_rate"])
+
+    @property
+    def frame_seconds(self) -> float:
+        """From one frame of a clip to the next."""
+        return self.frame_gap / self.control_rate
+
     def starts(self, frames: int) -> NDArray[np.int64]:
         """First rows of all clips of `frames` frames."""
         total = self._places(frames)[1][-1]
@@ -242,9 +254,9 @@ class ClipSource:
             None if tcp is None else torch.from_numpy(tcp).float(),
         )
 
-    def action_statistics(self, samples: int = 4096) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def action_statistics(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Mean and standard deviation of aggregated actions, (A,) each; a dimension that never changes gets 1."""
-        actions = self.actions_at(self.spread(samples, 2), 2)[:, 0].astype(np.float64)
+        actions = self.actions_at(self.spread(SAMPLED_ACTIONS, 2), 2)[:, 0].astype(np.float64)
         std = actions.std(0)
         return actions.mean(0), np.where(std > 1e-4 * np.abs(actions).max(0), std, 1.0)  # in whatever unit they are
 
@@ -257,8 +269,8 @@ class ClipSource:
                 self._columns[name] = action_changes(self._columns["action"], self.dataset.episode_slices)
             elif name == "action_followed":
                 self._hold(("action",))
-                rate = float(self.dataset.attrs["control_rate"])
-                self._columns[name] = actions_followed(self._columns["action"], self.dataset.episode_slices, rate)
+                actions, slices = self._columns["action"], self.dataset.episode_slices
+                self._columns[name] = actions_followed(actions, slices, self.control_rate)
             else:
                 self._columns[name] = self.dataset.load(name)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from typing import Literal, get_args
+import platform
+from pathlib import Path
+from typing import Any, Literal, get_args
 
 import torch
 
@@ -65,3 +67,13 @@ def best_precision(device: torch.device) -> torch.dtype:
     else:
         native = getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)()
     return torch.bfloat16 if native else torch.float32
+
+
+def describe(device: torch.device) -> dict[str, Any]:
+    """This machine, for people: `cpu` (its name), `cores`, and `gpu` (its name, None where the device is none)."""
+    cpu, info = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
+    if info.exists():
+        names = [line.partition(":")[2].strip() for line in info.read_text().splitlines() if "model name" in line]
+        cpu = names[0] if names else cpu
+    gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else None
+    return {"cpu": cpu, "cores": os.cpu_count(), "gpu": gpu}

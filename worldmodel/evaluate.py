@@ -19,6 +19,7 @@ from worldmodel.checkpoint import content_hashes, load_inference, load_model, lo
 from worldmodel.clips import ClipSource
 from worldmodel.devices import best_precision, find_device
 from worldmodel.evaluation_table import EvaluationTable
+from worldmodel.held_out import ValidationSet
 from worldmodel.interface import check_fits
 from worldmodel.measurement import Networks, Sampling, measure_copy, measure_model
 from worldmodel.memory import keep_freed_memory
@@ -27,7 +28,6 @@ from worldmodel.perceptual_weights import WeightsUnavailable, load_weights
 from worldmodel.sampling import Selection
 from worldmodel.scores import RESAMPLES
 from worldmodel.shelf import Shelf
-from worldmodel.validation import ValidationSet
 from worldmodel.world_model import WorldModel
 
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from worldmodel.held_out import ValidationSet
 from worldmodel.measurement import Measured, Sampling
 from worldmodel.scores import Statistics, compare_clips, score_clips
-from worldmodel.validation import ValidationSet
 
 VARIANTS = {"best": "latents_zero", "still": "without_motion", "posterior": "posterior"}
 """What was measured besides, and the key of the entry that it adds."""

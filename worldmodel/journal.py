@@ -23,7 +23,8 @@ class Journal:
     def __init__(self, folder: Path, step: int) -> None:
         self.path = folder / "metrics.jsonl"
         _forget_after(step, self.path)
-        self.board = SummaryWriter(str(folder / "tensorboard"), purge_step=step)
+        # TensorBoard forgets from purge_step on; what was told of the checkpoint itself stays.
+        self.board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
 
     def write(self, kind: str, step: int, values: Mapping[str, Any]) -> None:
         """One line; of a list (one value per predicted step) TensorBoard is shown the last."""

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from worldmodel.clips import Clips
 from worldmodel.inference import InferenceNetwork
+from worldmodel.losses import divergence
 from worldmodel.scores import Statistics
 from worldmodel.world_model import WorldModel
 
@@ -26,9 +27,8 @@ def infer_latents(model: WorldModel, inference: InferenceNetwork, clips: Clips) 
     with torch.autocast(model.device.type, model.precision, enabled=model.precision != torch.float32):
         mean, log_variance = inference(model.frame(clips.rgb, clips.depth))
     once = slice(0, 1) if inference.per_clip else slice(None)
-    each = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance)
-    divergence = each[:, once].flatten(2).sum(-1).flatten()
-    return mean, {"means": mean[:, once].flatten(2).flatten(0, 1), "divergence": divergence}
+    of_each = divergence(mean, log_variance)[:, once].flatten(2).sum(-1).flatten()
+    return mean, {"means": mean[:, once].flatten(2).flatten(0, 1), "divergence": of_each}
 
 
 def latent_use(inferred: Statistics) -> dict[str, Any]:

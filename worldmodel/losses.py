@@ -212,5 +212,9 @@ def kl_to_prior(mean: Tensor, log_variance: Tensor, pixels: int) -> Tensor:
         mean, log_variance: (..., Z, h, w).
         pixels: of one frame.
     """
-    divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance)
-    return divergence.sum((-3, -2, -1)).mean() / pixels
+    return divergence(mean, log_variance).sum((-3, -2, -1)).mean() / pixels
+
+
+def divergence(mean: Tensor, log_variance: Tensor) -> Tensor:
+    """KL(N(mean, var) || N(0, 1)) of each number, in nats; the shape stays."""
+    return 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance)

@@ -13,21 +13,24 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from worldmodel.clips import Clips, ClipTruth
+from worldmodel.held_out import ValidationSet
 from worldmodel.inference import InferenceNetwork
 from worldmodel.latents import infer_latents, latent_use
 from worldmodel.metrics import relative_depth_error, squared_error, ssim
-from worldmodel.motion_scores import motion_statistics, no_motion, predicted_motion, true_motion
+from worldmodel.motion_scores import flow_statistics, motion_statistics, no_motion, predicted_motion, true_motion
 from worldmodel.perceptual import PerceptualNetwork
 from worldmodel.rollout import Rollout, unroll
 from worldmodel.sampling import Selection, best_future, draw_latents, predict_futures
 from worldmodel.scores import Statistics, join
 from worldmodel.shelf import NOTHING_KEPT, Shelf
-from worldmodel.t3vip import T3VIP
-from worldmodel.validation import MIN_WAY_M, ValidationSet, track_tcp
+from worldmodel.t3vip import T3VIP, CloudPrediction
+from worldmodel.tracking import tcp_way
 from worldmodel.world_model import WorldModel
 
 Tick = Callable[[int], Any]
 """Told how many more clips are done."""
+MIN_WAY_M = 0.03
+"""Clips in which the hand goes less than this far do not count for the tracking error."""
 _LATENTS = "latents"
 
 
@@ -56,7 +59,7 @@ class Sampling:
 
 @dataclass
 class Measured:
-    """Statistics of all clips by kind of prediction: `zero`, `best`, `still`, `posterior`; and the latents' use."""
+    """Statistics of all clips by kind of prediction: `zero`, `best`, `still`, `posterior`, `copy`; the latents' use."""
 
     kinds: dict[str, Statistics]
     latents: dict[str, Any] | None = None
@@ -79,9 +82,7 @@ def measure_copy(data: ValidationSet, networks: Networks | None, tick: Tick, she
 
 
 def _copied(data: ValidationSet, clips: Clips, starts: NDArray[np.int64], networks: Networks | None) -> Statistics:
-    c = data.context
-    rgb, depth = clips.rgb[:, c - 1 : c].expand_as(clips.rgb[:, c:]), clips.depth[:, c - 1 : c]
-    statistics = _frames(rgb, depth.expand_as(clips.depth[:, c:]), clips, c, networks)
+    c, statistics = data.context, _frames_copied(clips, data.context, networks)
     statistics["inpainted"] = torch.zeros_like(statistics["se"])
     if data.source.dataset.has_ground_truth:
         truth = data.source.truth_at(starts, data.frames)
@@ -103,6 +104,7 @@ def measure_model(
     still: bool = False,
     tick: Tick = lambda clips: None,
     shelf: Shelf = NOTHING_KEPT,
+    brief: bool = False,
 ) -> Measured:
     """Free-running prediction after the context, and motion one step ahead of true frames.
 
@@ -115,12 +117,13 @@ def measure_model(
         still: measure the kind `still` too: the same model with every transform the identity, or every kernel a copy.
         tick: told of progress.
         shelf: where batches that were measured are kept and looked for; by default nowhere.
+        brief: measure what is quickly measured: errors of colour, depth, scene flow and tracking; and the kind `copy`.
     """
     parts = []
     for number, (clips, starts) in enumerate(data.batches()):
         found = shelf.find(number)
         if found is None:
-            measured = _predicted(model, data, clips, starts, networks, sampling, inference, still, tick)
+            measured = _predicted(model, data, clips, starts, networks, sampling, inference, still, tick, brief)
             found = shelf.put(number, {f"{k}/{n}": value for k, some in measured.items() for n, value in some.items()})
         else:
             tick(len(starts))
@@ -143,6 +146,7 @@ def _predicted(
     inference: InferenceNetwork | None,
     still: bool,
     tick: Tick,
+    brief: bool,
 ) -> dict[str, Statistics]:
     """One batch of `measure_model`, by kind of prediction; and what its latents carry."""
     clips, c = clips.to(model.device), data.context
@@ -150,11 +154,13 @@ def _predicted(
     kinds: dict[str, Statistics] = {}
     for kind in ["zero"] + ["still"] * still:
         free = unroll(model, clips, c, still=kind == "still")
-        kinds[kind] = _free(model, free, clips, c, networks)
+        kinds[kind] = _free(model, free, clips, c, networks, brief)
         if isinstance(model, T3VIP) and truth is not None:
             if truth.tcp is not None:
-                kinds[kind] |= _tracking(*track_tcp(model, clips, truth.tcp, free, c))
-            kinds[kind] |= _taught(model, data, clips, truth, kind == "still")
+                kinds[kind] |= _tracking(*_track_tcp(model, clips, truth.tcp, free, c))
+            kinds[kind] |= _taught(model, data, clips, truth, kind == "still", brief)
+    if brief:
+        kinds["copy"] = _frames_copied(clips, c, networks, brief)
     if inference is not None:
         mean, kinds[_LATENTS] = infer_latents(model, inference, clips)
         kinds["posterior"] = _free(model, unroll(model, clips, c, mean), clips, c, networks)
@@ -170,33 +176,63 @@ def _predicted(
     return kinds
 
 
-def _frames(rgb: Tensor, depth: Tensor | None, clips: Clips, context: int, networks: Networks | None) -> Statistics:
+def _frames(
+    rgb: Tensor, depth: Tensor | None, clips: Clips, context: int, networks: Networks | None, brief: bool = False
+) -> Statistics:
     """Of predicted frames (B, P, C, H, W), (B, P) each."""
     rgb, true = rgb.clamp(0, 1), clips.rgb[:, context:]
     shape, flat, flat_true = rgb.shape[:2], rgb.flatten(0, 1), true.flatten(0, 1)
-    statistics = {"se": squared_error(rgb, true), "ssim": ssim(flat, flat_true).view(shape)}
+    statistics = {"se": squared_error(rgb, true)}
+    if not brief:
+        statistics["ssim"] = ssim(flat, flat_true).view(shape)
     if networks is not None:
         lpips, cosine = networks.deciding(flat, flat_true)
         statistics |= {"lpips": lpips.view(shape), "cosine": cosine.view(shape)}
     if depth is not None:
         true_depth = clips.depth[:, context:]
         statistics["depth_se"] = squared_error(depth, true_depth)
-        statistics["depth_absrel"] = relative_depth_error(depth, true_depth)
+        if not brief:
+            statistics["depth_absrel"] = relative_depth_error(depth, true_depth)
     return statistics
 
 
-def _free(model: WorldModel, free: Rollout, clips: Clips, context: int, networks: Networks | None) -> Statistics:
+def _frames_copied(clips: Clips, context: int, networks: Networks | None, brief: bool = False) -> Statistics:
+    """The last context frame in the place of those after it."""
+    rgb, depth = (seen[:, context - 1 : context].expand_as(seen[:, context:]) for seen in (clips.rgb, clips.depth))
+    return _frames(rgb, depth, clips, context, networks, brief)
+
+
+def _free(
+    model: WorldModel, free: Rollout, clips: Clips, context: int, networks: Networks | None, brief: bool = False
+) -> Statistics:
     rgb = free.stack("rgb")[:, context - 1 :]
     if not isinstance(model, T3VIP):
-        return _frames(rgb, None, clips, context, networks)
-    statistics = _frames(rgb, free.stack("depth")[:, context - 1 :], clips, context, networks)
+        return _frames(rgb, None, clips, context, networks, brief)
+    statistics = _frames(rgb, free.stack("depth")[:, context - 1 :], clips, context, networks, brief)
     return statistics | {"inpainted": free.stack("occlusion")[:, context - 1 :].mean((2, 3, 4))}
 
 
-def _taught(model: T3VIP, data: ValidationSet, clips: Clips, truth: ClipTruth, still: bool) -> Statistics:
-    camera, c = data.source.dataset.camera, data.context
-    predicted = predicted_motion(unroll(model, clips, c, truth=1.0, still=still), c)
-    return motion_statistics(predicted, true_motion(camera, clips, truth, c), truth.hand[:, c - 1 :])
+def _taught(model: T3VIP, data: ValidationSet, clips: Clips, truth: ClipTruth, still: bool, brief: bool) -> Statistics:
+    c = data.context
+    taught, hand = unroll(model, clips, c, truth=1.0, still=still), truth.hand[:, c - 1 :]
+    if brief:
+        flow = taught.stack("scene_flow")[:, c - 1 :].cpu()
+        return flow_statistics(flow, truth.scene_flow[:, c - 1 :], hand)
+    return motion_statistics(
+        predicted_motion(taught, c), true_motion(data.source.dataset.camera, clips, truth, c), hand
+    )
+
+
+def _track_tcp(model: T3VIP, clips: Clips, tcp: Tensor, free: Rollout, context: int) -> tuple[Tensor, Tensor]:
+    """How far the TCP, moved by predicted transforms, is off at the clip's end, and how far it went, (B,) metres."""
+    points = clips.depth[:, context - 1] * model.rays
+    clouds = [p for p in free.predictions[context - 1 :] if isinstance(p, CloudPrediction)]
+    ends = []
+    for b in range(len(points)):
+        steps = ((cloud.transform[b : b + 1], cloud.masks[b : b + 1, :1]) for cloud in clouds)
+        ends.append(tcp_way(points[b], tcp[b, context - 1].to(points), model.intrinsics, steps)[-1].cpu())
+    error = (torch.stack(ends) - tcp[:, -1]).norm(dim=1)
+    return error, (tcp[:, -1] - tcp[:, context - 1]).norm(dim=1)
 
 
 def _tracking(error: Tensor, way: Tensor) -> Statistics:

@@ -10,17 +10,8 @@ MOVING_M = 0.005
 """A pixel whose point truly moves farther than this from frame to frame is moving."""
 STILL_M = 0.0005
 """One whose point moves less than this is still."""
-
-
-def psnr_per_step(predicted: Tensor, target: Tensor) -> Tensor:
-    """PSNR of pictures in [0, 1], of the mean squared error over all clips: `(B, T, C, H, W)` twice to (T,) dB."""
-    error = (predicted.clamp(0, 1) - target).square().mean((0, 2, 3, 4))
-    return -10 * torch.log10(error.clamp(min=1e-12))
-
-
-def rmse_per_step(predicted: Tensor, target: Tensor) -> Tensor:
-    """Root mean squared error over all clips: `(B, T, C, H, W)` twice to (T,), in their unit."""
-    return (predicted - target).square().mean((0, 2, 3, 4)).sqrt()
+SSIM_SIGMA = 1.5
+"""Of the Gaussian window of SSIM, 11 pixels wide, in pixels."""
 
 
 def squared_error(predicted: Tensor, target: Tensor) -> Tensor:
@@ -33,18 +24,17 @@ def relative_depth_error(predicted: Tensor, target: Tensor) -> Tensor:
     return ((predicted - target).abs() / target.clamp(min=1e-6)).mean((-3, -2, -1))
 
 
-def ssim(predicted: Tensor, target: Tensor, sigma: float = 1.5) -> Tensor:
+def ssim(predicted: Tensor, target: Tensor) -> Tensor:
     """Structural similarity (Wang et al. 2004) of pictures in [0, 1], each channel by itself, edges reflected.
 
     Args:
         predicted, target: (N, C, H, W), sides of more than 5 pixels.
-        sigma: of the Gaussian window, 11 pixels wide, in pixels.
 
     Returns:
         (N,), the mean over channels and pixels; 1 for equal pictures.
     """
-    radius = int(3.5 * sigma + 0.5)
-    window = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, device=predicted.device) / sigma).square())
+    radius = 5
+    window = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, device=predicted.device) / SSIM_SIGMA).square())
     window = window / window.sum()
 
     def blur(x: Tensor) -> Tensor:
@@ -81,34 +71,3 @@ def adjusted_rand_index(ours: Tensor, theirs: Tensor) -> float:
     a, b = pairs(joint.sum(1)), pairs(joint.sum(0))
     expected, most = a * b / pairs(joint.sum()), (a + b) / 2
     return 1.0 if most == expected else (pairs(joint) - expected) / (most - expected)
-
-
-def relative_flow_error(predicted: Tensor, true: Tensor, where: Tensor) -> float:
-    """Mean end-point error over the mean length of the true flow on the pixels `where`: 1 is predicting no motion.
-
-    Args:
-        predicted, true: (..., 3, H, W) metres.
-        where: (..., H, W) bool.
-    """
-    error = (predicted - true).norm(dim=-3)[where].mean()
-    return float(error / true.norm(dim=-3)[where].mean())
-
-
-def flow_scores(predicted: Tensor, true: Tensor, hand: Tensor) -> dict[str, float]:
-    """Motion against the simulator.
-
-    Args:
-        predicted, true: (B, T, 3, H, W) scene flow, metres.
-        hand: (B, T, H, W) bool.
-
-    Returns:
-        `flow_error_moving`, `flow_error_hand` (relative to predicting no motion), `false_flow_m` (mean length
-        predicted on still pixels).
-    """
-    length = true.norm(dim=2)
-    moving = length > MOVING_M
-    return {
-        "flow_error_moving": relative_flow_error(predicted, true, moving),
-        "flow_error_hand": relative_flow_error(predicted, true, moving & hand),
-        "false_flow_m": float(predicted.norm(dim=2)[length < STILL_M].mean()),
-    }

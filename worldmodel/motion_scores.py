@@ -66,34 +66,49 @@ def no_motion(truth: Motion) -> Motion:
     return Motion(*(torch.zeros_like(field) for field in vars(truth).values()))
 
 
-def motion_statistics(predicted: Motion, truth: Motion, hand: Tensor) -> Statistics:
-    """What the motion scores are made of, summed over the frames of a clip, (B, 1) each.
+def flow_statistics(predicted: Tensor, true: Tensor, hand: Tensor) -> Statistics:
+    """What the scores of scene flow are made of, summed over the frames of a clip, (B, 1) each.
 
     Args:
+        predicted, true: (B, P, 3, H, W) metres.
         hand: (B, P, H, W) bool, pixels of the end-effector.
     """
-    length = truth.scene_flow.norm(dim=2)
-    error = (predicted.scene_flow - truth.scene_flow).norm(dim=2)
-    error_px = (predicted.optical_flow - truth.optical_flow).norm(dim=2)
+    length, error = true.norm(dim=2), (predicted - true).norm(dim=2)
     moving, still = length > MOVING_M, length < STILL_M
     hand = hand & moving
-    ours, theirs = predicted.disocclusion, truth.disocclusion
     pixels = {
         "moving": moving,
         "moving_error": error * moving,
         "moving_length": length * moving,
-        "moving_error_px": error_px * moving,
         "hand": hand,
         "hand_error": error * hand,
         "hand_length": length * hand,
         "still": still,
-        "still_flow": predicted.scene_flow.norm(dim=2) * still,
+        "still_flow": predicted.norm(dim=2) * still,
+    }
+    return _sums(pixels)
+
+
+def motion_statistics(predicted: Motion, truth: Motion, hand: Tensor) -> Statistics:
+    """What all motion scores are made of, summed over the frames of a clip, (B, 1) each.
+
+    Args:
+        hand: (B, P, H, W) bool, pixels of the end-effector.
+    """
+    error_px = (predicted.optical_flow - truth.optical_flow).norm(dim=2)
+    ours, theirs = predicted.disocclusion, truth.disocclusion
+    pixels = {
+        "moving_error_px": error_px * (truth.scene_flow.norm(dim=2) > MOVING_M),
         "found": ours & theirs,
         "invented": ours & ~theirs,
         "missed": ~ours & theirs,
     }
-    sums = {name: field.double().sum((1, 2, 3)).unsqueeze(1) for name, field in pixels.items()}
-    return sums | _segmentation(predicted.parts, truth.parts)
+    flow = flow_statistics(predicted.scene_flow, truth.scene_flow, hand)
+    return flow | _sums(pixels) | _segmentation(predicted.parts, truth.parts)
+
+
+def _sums(pixels: dict[str, Tensor]) -> Statistics:
+    return {name: field.double().sum((1, 2, 3)).unsqueeze(1) for name, field in pixels.items()}
 
 
 def _segmentation(ours: Tensor, theirs: Tensor) -> Statistics:

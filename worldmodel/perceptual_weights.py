@@ -39,6 +39,11 @@ class WeightsUnavailable(UsageError):
     """They are not cached and cannot be fetched."""
 
 
+def are_cached() -> bool:
+    """Whether `load_weights` needs no network."""
+    return (cache_dir() / FILE).exists()
+
+
 def load_weights() -> dict[str, Tensor]:
     """The weights, from the cache folder; fetched and put there the first time.
 

@@ -68,7 +68,9 @@ def predict(name: str, model: WorldModel, clips: Clips, context: int, samples: i
     return Shown(name, model, predictions, drawn)
 
 
-def storyboard(clips: Clips, truth: ClipTruth | None, context: int, models: Sequence[Shown]) -> Storyboard:
+def storyboard(
+    clips: Clips, truth: ClipTruth | None, context: int, models: Sequence[Shown], frame_seconds: float
+) -> Storyboard:
     """The paper's qualitative figure of the first clip: in each section the truth, where it is known, and each model.
 
     What is seen in frame t belongs to column t; so does the motion that led there from frame t-1, and what that
@@ -79,11 +81,12 @@ def storyboard(clips: Clips, truth: ClipTruth | None, context: int, models: Sequ
         truth: motion, where the dataset knows it.
         context: frames that the models saw.
         models: at least one, all of one camera and frame gap.
+        frame_seconds: from one frame to the next.
     """
-    model, blank = models[0].model, [None] * context
+    camera, blank = models[0].model.camera, [None] * context
     spatial = [shown for shown in models if shown.clouds]
-    motion = None if truth is None else TrueMotion.of(model.camera, clips, truth)
-    scales = _scales(model.camera, clips, motion, spatial)
+    motion = None if truth is None else TrueMotion.of(camera, clips, truth)
+    scales = _scales(camera, clips, motion, spatial)
     near, far = scales.near, scales.far
     strips = [Strip(RGB, TRUTH, [colours.rgb_colours(picture) for picture in clips.rgb[0]])]
     for shown in models:
@@ -103,7 +106,7 @@ def storyboard(clips: Clips, truth: ClipTruth | None, context: int, models: Sequ
             strips.append(Strip(section, TRUTH, [*blank, *motion.pictures(section, scales)[context - 1 :]]))
         for shown in spatial:
             strips.append(_strip(section, shown, context, [_motion(section, p, scales) for p in shown.clouds]))
-    return Storyboard(strips, scales, context, model.frame_gap / model.context.control_rate)
+    return Storyboard(strips, scales, context, frame_seconds)
 
 
 @dataclass(frozen=True)
@@ -136,11 +139,18 @@ class TrueMotion:
 
 
 def picture_prediction(
-    model: WorldModel, clips: Clips, truth: ClipTruth | None, context: int, path: Path, scale: int = 2
+    model: WorldModel,
+    clips: Clips,
+    truth: ClipTruth | None,
+    context: int,
+    frame_seconds: float,
+    path: Path,
+    scale: int = 2,
 ) -> None:
     """Write a PNG of a free-running prediction of the first clip beside the truth; see `storyboard`."""
     shown = predict(model.kind.upper(), model, clips, context)
-    write_sheet(storyboard(_first(clips), truth, context, [shown]), path, clips.rgb.shape[1] - context, scale)
+    board = storyboard(_first(clips), truth, context, [shown], frame_seconds)
+    write_sheet(board, path, clips.rgb.shape[1] - context, scale)
 
 
 def _first(clips: Clips) -> Clips:

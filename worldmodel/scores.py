@@ -75,7 +75,13 @@ SCORES: tuple[Score, ...] = (
         _ratio("hand_error", "hand_length"),
     ),
     Score("false_flow_m", "false flow on still pixels, m", "lower", ("still",), _ratio("still_flow", "still"), 5),
-    Score("flow2d_epe_moving", "2D flow EPE, moving, px", "lower", ("moving",), _ratio("moving_error_px", "moving")),
+    Score(
+        "flow2d_epe_moving",
+        "2D flow EPE, moving, px",
+        "lower",
+        ("moving_error_px",),
+        _ratio("moving_error_px", "moving"),
+    ),
     Score("disocclusion_f1", "disocclusion F1", "higher", ("found",), _f1),
     Score(
         "motion_ari", "ARI, moving or not", "higher", ("frames_in_motion",), _ratio("motion_ari", "frames_in_motion")

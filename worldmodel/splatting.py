@@ -21,7 +21,7 @@ LAYER_GAP_M = 0.01
 MIN_WEIGHT = 1e-4
 
 _FAR_OUTSIDE = 4.0  # in normalised coordinates, where the picture is [-1, 1]: dropped by zero padding
-_BILINEAR, _ZEROS, _ALIGN_CORNERS = 0, 0, True
+_BILINEAR, _ZEROS, _BORDER, _ALIGN_CORNERS = 0, 0, 1, True
 
 
 def _scatter(values: Tensor, grid: Tensor) -> Tensor:
@@ -110,6 +110,11 @@ def _grid(pixels: Tensor) -> Tensor:
     return grid.clamp(-_FAR_OUTSIDE, _FAR_OUTSIDE).contiguous()
 
 
+def _around(values: Tensor, grid: Tensor) -> Tensor:
+    """Bilinearly at each place, beyond the edge as on it: what is half outside still lies over what is there."""
+    return torch.grid_sampler_2d(values, grid, _BILINEAR, _BORDER, _ALIGN_CORNERS)
+
+
 @torch.no_grad()
 def _visible(pixels: Tensor, depth: Tensor, in_front: Tensor) -> Tensor:
     """How much of each point is seen when nearer points lie over it, in [0, 1]: (B, 1, H, W).
@@ -120,9 +125,9 @@ def _visible(pixels: Tensor, depth: Tensor, in_front: Tensor) -> Tensor:
     """
     grid = _grid(pixels)
     depth_sum, count = _scatter(torch.cat((depth * in_front, in_front), dim=1), grid).split(1, dim=1)
-    mean = torch.grid_sampler_2d(depth_sum / count.clamp(min=1e-6), grid, _BILINEAR, _ZEROS, _ALIGN_CORNERS)
+    mean = _around(depth_sum / count.clamp(min=1e-6), grid)
     upper = in_front * (depth < mean - LAYER_GAP_M)
-    cover = torch.grid_sampler_2d(_scatter(upper, grid), grid, _BILINEAR, _ZEROS, _ALIGN_CORNERS)
+    cover = _around(_scatter(upper, grid), grid)
     return torch.where(depth > mean + LAYER_GAP_M, 1 - cover.clamp(0, 1), 1.0)
 
 

@@ -54,11 +54,12 @@ class CloudPrediction(Prediction):
 class TransformHead(nn.Module):
     """Motion embedding and action to K - 1 rigid transforms.
 
-    At initialisation none of them turns, and each is shifted by the action in a direction of its own.
+    At initialisation none of them turns and, up to a hundredth of a pixel, none shifts; with `shift`, each is shifted
+    by the action in a direction of its own.
 
     Args:
         inputs: numbers in a motion embedding.
-        action_dim: numbers in an action; without any, each transform starts with a shift that is always the same.
+        action_dim: numbers in an action; without any, `shift` makes each start with one that is always the same.
         count: of transforms.
         width: multiplier on the channels.
         unit: what a translation of 1 is in the last layer, metres.

@@ -9,6 +9,7 @@ A point on the surface of a thing is moved as the points around it are, each by 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -21,26 +22,44 @@ LEAST_FOREGROUND = 0.02  # below this share of anything that moves, the hand cou
 MIN_HAND_PIXELS = 6  # of the fewest that a 64 x 64 picture shows of an unoccluded hand
 
 
-def hand_pixels(points: Tensor, tcp: Tensor, radius: float = HAND_RADIUS, least: int = MIN_HAND_PIXELS) -> Tensor:
-    """Which pixels show the hand: those whose point is within `radius` of the TCP.
+def hand_pixels(points: Tensor, tcp: Tensor) -> Tensor:
+    """Which pixels show the hand: those whose point is within HAND_RADIUS of the TCP.
 
-    Where fewer than `least` are (the hand is hidden, or the TCP is far from any surface), the radius grows until it
-    holds `least` of them.
+    Where fewer than MIN_HAND_PIXELS are (the hand is hidden, or the TCP is far from any surface), the radius grows
+    until it holds as many.
 
     Args:
         points: (3, H, W) visible points, metres, in the frame of `tcp`.
         tcp: (3,) metres.
-        radius: metres.
-        least: pixels.
 
     Returns:
-        indices: (M,) int64 into the H*W pixels, row by row; M >= `least`.
+        indices: (M,) int64 into the H*W pixels, row by row.
     """
     distance = (points - tcp[:, None, None]).norm(dim=0).flatten()
-    near = (distance <= radius).nonzero().squeeze(1)
-    if len(near) >= least:
+    near = (distance <= HAND_RADIUS).nonzero().squeeze(1)
+    if len(near) >= MIN_HAND_PIXELS:
         return near
-    return distance.topk(least, largest=False).indices
+    return distance.topk(MIN_HAND_PIXELS, largest=False).indices
+
+
+def tcp_way(points: Tensor, tcp: Tensor, K: Tensor, steps: Iterable[tuple[Tensor, Tensor]]) -> Tensor:
+    """Where predictions take the TCP in one future, by `HandTrack`; camera frame, metres.
+
+    Args:
+        points: (3, H, W) what is seen in the last observed frame.
+        tcp: (3,) then.
+        K: (3, 3) intrinsics.
+        steps: of each of P predictions the blended transform (1, 3, 4, H, W) and the background's mask (1, 1, H, W).
+
+    Returns:
+        (P+1, 3), from where it was seen on.
+    """
+    track = HandTrack.start(points.flatten(1)[:, hand_pixels(points, tcp)].T, tcp, K, 1)
+    way = [track.tcp]
+    for transform, background in steps:
+        track = track.advance(transform, background)
+        way.append(track.tcp)
+    return torch.cat(way)
 
 
 class Track(Protocol):
@@ -76,18 +95,9 @@ class HandTrack:
     K: Tensor
 
     @classmethod
-    def start(cls, points: Tensor, tcp: Tensor, K: Tensor, futures: int, radius: float = HAND_RADIUS) -> HandTrack:
-        """Choose the hand's pixels in the last observed frame.
-
-        Args:
-            points: (3, H, W) unprojected depth, metres.
-            tcp: (3,) metres, camera frame.
-            K: (3, 3).
-            futures: N.
-            radius: metres; see `hand_pixels`.
-        """
-        hand = points.flatten(1)[:, hand_pixels(points, tcp, radius)].T  # (M, 3)
-        return cls(tcp.expand(futures, 3), hand.expand(futures, *hand.shape), K)
+    def start(cls, points: Tensor, tcp: Tensor, K: Tensor, futures: int) -> HandTrack:
+        """Follow the TCP (3,) by the hand's points (M, 3)."""
+        return cls(tcp.expand(futures, 3), points.expand(futures, *points.shape), K)
 
     def advance(self, transform: Tensor, background: Tensor) -> HandTrack:
         """One predicted step on.

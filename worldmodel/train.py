@@ -17,14 +17,14 @@ from envs.files import locked, write_json
 from worldmodel.budget import Cost, measure_cost
 from worldmodel.clips import ClipSource
 from worldmodel.config_file import changed, read_config
-from worldmodel.devices import find_device, find_precision, prepare_devices
+from worldmodel.devices import describe, find_device, find_precision, prepare_devices
+from worldmodel.held_out import ValidationSet
 from worldmodel.memory import keep_freed_memory
 from worldmodel.models import make_model, named_config
 from worldmodel.options import PRESETS, TrainOptions
 from worldmodel.ranks import Ranks, join_ranks
 from worldmodel.trainer import Trainer
 from worldmodel.training_data import model_context, open_data, settled
-from worldmodel.validation import ValidationSet
 
 HOW_NOT_WHAT = ("device", "deterministic", "cuda_graphs", "memory_limit", "save_every", "log_every")
 """Options that a run may go on with others of."""
@@ -72,6 +72,7 @@ def make_trainer(options: TrainOptions, train: ClipSource, validation: Validatio
         "options": document_of(options),
         "data": {"train": train.dataset.content_hash, "validation": validation.source.dataset.content_hash},
         "versions": {"torch": torch.__version__},
+        "machine": describe(ranks.device),
     }
     return Trainer(model, options, train, validation, origin, ranks)
 

@@ -7,6 +7,7 @@ import math
 import signal
 import time
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from worldmodel.checkpoint import load_training, save_model, save_training
 from worldmodel.clips import Clips, ClipSource
 from worldmodel.colour_jitter import ColourJitter
 from worldmodel.devices import find_precision
+from worldmodel.held_out import ValidationSet
 from worldmodel.inference import InferenceNetwork, inference_network
 from worldmodel.journal import Journal, finite
 from worldmodel.objective import StepInputs, objective
@@ -28,7 +30,7 @@ from worldmodel.pictures import picture_prediction
 from worldmodel.ranks import ALONE, Ranks
 from worldmodel.recording import Recorder
 from worldmodel.stopping import stop_signals
-from worldmodel.validation import Scores, ValidationSet, summary, validate
+from worldmodel.validation import Scores, summary, validate
 from worldmodel.world_model import WorldModel
 
 logger = logging.getLogger(__name__)
@@ -98,15 +100,17 @@ class Trainer:
             self._check_data(state.get("data"))
         self.ranks.begin_alike(self.parameters, self.step)
         first = self.ranks.first
-        journal = Journal(options.out, self.step) if first else None
         started = time.monotonic()
         base_seconds = self.seconds
         waited = 0.0
         terms: dict[str, float] = {}
-        bar = tqdm(
-            total=options.steps, initial=self.step, desc="train", unit="step", dynamic_ncols=True, disable=not first
-        )
-        with stop_signals() as stops:
+        with ExitStack() as opened:  # however it ends, what the journal still holds is written
+            journal = opened.enter_context(closing(Journal(options.out, self.step))) if first else None
+            bar = tqdm(
+                total=options.steps, initial=self.step, desc="train", unit="step", dynamic_ncols=True, disable=not first
+            )
+            opened.enter_context(bar)
+            stops = opened.enter_context(stop_signals())
             while self.step < options.steps:
                 self.model.train()
                 asked = time.monotonic()
@@ -132,9 +136,6 @@ class Trainer:
                     if journal:
                         bar.write(f"stopped at step {self.step}; the same command goes on from here")
                     break
-        bar.close()
-        if journal:
-            journal.close()
         if signal.SIGINT in stops:
             raise KeyboardInterrupt
         if self.step < options.steps:
@@ -250,11 +251,11 @@ class Trainer:
         scores = validate(self.model, self.validation)
         journal.write("validation", self.step, scores)
         clips, starts = next(self.validation.batches())
-        truth = None
-        if self.validation.source.dataset.has_ground_truth:
-            truth = self.validation.source.truth_at(starts[:1], self.validation.frames)
+        source, truth = self.validation.source, None
+        if source.dataset.has_ground_truth:
+            truth = source.truth_at(starts[:1], self.validation.frames)
         picture = self.options.out / "pictures" / f"step-{self.step:08d}.png"
-        picture_prediction(self.model, clips, truth, self.options.context, picture)
+        picture_prediction(self.model, clips, truth, self.options.context, source.frame_seconds, picture)
         score = float(scores["score"])  # type: ignore[arg-type]
         if score >= self.best:
             self.best = score

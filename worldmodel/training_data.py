@@ -10,11 +10,11 @@ from envs.errors import UsageError
 from envs.planar_push.objects import SPLITS, canonical
 from worldmodel.clips import HELD, ClipSource, usual_column
 from worldmodel.config import ModelContext
+from worldmodel.held_out import ValidationSet
 from worldmodel.interface import Interface, mismatch
 from worldmodel.memory import available_memory
 from worldmodel.options import TrainOptions
 from worldmodel.ranks import processes_here
-from worldmodel.validation import ValidationSet
 
 TEST_ONLY = "TabletopD-v0"
 """The unseen scene; training or tuning on it would make every figure about generalisation worthless."""

@@ -1,137 +1,68 @@
-"""How good a model is on clips that it was not trained on, beside copying the last frame it saw."""
+"""How good a model is on clips that it was not trained on, beside copying the last frame it saw: while it trains."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from math import isfinite
+import math
+from statistics import fmean
+from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
-from worldmodel.clips import Clips, ClipSource
-from worldmodel.metrics import flow_scores, psnr_per_step, rmse_per_step
-from worldmodel.rollout import Rollout, unroll
-from worldmodel.t3vip import T3VIP, CloudPrediction
-from worldmodel.tracking import HandTrack
+from worldmodel.held_out import ValidationSet
+from worldmodel.measurement import measure_model
+from worldmodel.scores import Statistics, score_clips
+from worldmodel.t3vip import T3VIP
 from worldmodel.world_model import WorldModel
 
 Scores = dict[str, float | list[float]]
-MIN_WAY_M = 0.03
-"""Clips in which the hand goes less than this far do not count for the tracking error."""
+_MEANS = {
+    "inpainted": "inpainted",
+    "flow_error_moving": "flow3d_epe_moving_relative",
+    "flow_error_hand": "flow3d_epe_hand_relative",
+    "false_flow_m": "false_flow_m",
+    "tracking_error": "tracking_error",
+}
+"""What they are called here, and in `scores.SCORES`."""
 
 
-@dataclass(frozen=True)
-class ValidationSet:
-    """A fixed set of held-out clips.
-
-    Args:
-        source: where they come from.
-        clips: how many, spread evenly over the data.
-        frames: of each clip, context included.
-        context: how many frames the model sees.
-    """
-
-    source: ClipSource
-    clips: int = 64
-    frames: int = 12
-    context: int = 2
-    batch: int = 16
-
-    def batches(self) -> Iterator[tuple[Clips, NDArray[np.int64]]]:
-        """The clips in batches, with their first rows."""
-        starts = self.source.spread(self.clips, self.frames)
-        for first in range(0, len(starts), self.batch):
-            chosen = starts[first : first + self.batch]
-            yield self.source.at(chosen, self.frames), chosen
-
-
-@torch.inference_mode()
-def validate(model: WorldModel, data: ValidationSet, still: bool = False) -> Scores:
+def validate(model: WorldModel, data: ValidationSet) -> Scores:
     """Score free-running prediction with latents at 0, and motion where the dataset knows it.
 
     Args:
         model: any world model; left in the mode it was in.
         data: the held-out clips.
-        still: pretend that every transform is the identity; the scores must then be those of copying.
 
     Returns:
         Per predicted step after the context: `psnr`, `copy_psnr` (dB), and of T3VIP `depth_rmse`, `copy_depth_rmse`
         (metres) and `depth_psnr` (dB; its peak is the camera's working range, far less near). Means: `score` (RGB PSNR,
         of T3VIP plus depth PSNR, in dB: the paper's tuning metric); of T3VIP `inpainted` (share of pixels) and, with
-        ground truth, the terms of `flow_scores`, one step ahead of true frames; of an arm `tracking_error`: how far
-        the moved TCP is off at the end of the clip, over how far it really went. A term that nothing moves for is
-        left out.
+        ground truth, one step ahead of true frames, `flow_error_moving` and `flow_error_hand` (relative to predicting
+        no motion) and `false_flow_m` (mean length predicted on still pixels); of an arm `tracking_error`: how far the
+        moved TCP is off at the end of the clip, over how far it really went. A term that nothing moves for is left out.
     """
     was_training = model.training
-    model.eval()
-    device = model.device
-    predicted_rgb, predicted_depth, rgb, depth, inpainted = [], [], [], [], []
-    flows: list[tuple[Tensor, Tensor, Tensor]] = []
-    tracked: list[tuple[Tensor, Tensor]] = []
-    c = data.context
-    for clips, starts in data.batches():
-        clips = clips.to(device)
-        free = unroll(model, clips, c, still=still)
-        predicted_rgb.append(free.stack("rgb")[:, c - 1 :].cpu())
-        rgb.append(clips.rgb[:, c - 1 :].cpu())
-        if not isinstance(model, T3VIP):
-            continue
-        predicted_depth.append(free.stack("depth")[:, c - 1 :].cpu())
-        depth.append(clips.depth[:, c - 1 :].cpu())
-        inpainted.append(free.stack("occlusion")[:, c - 1 :].mean((1, 2, 3, 4)).cpu())
-        if data.source.dataset.has_ground_truth:
-            truth = data.source.truth_at(starts, data.frames)
-            taught = unroll(model, clips, c, truth=1.0, still=still)
-            flow = taught.stack("scene_flow")[:, c - 1 :].cpu()
-            flows.append((flow, truth.scene_flow[:, c - 1 :], truth.hand[:, c - 1 :]))
-            if truth.tcp is not None:
-                tracked.append(track_tcp(model, clips, truth.tcp, free, c))
+    kinds = measure_model(model.eval(), data, brief=True).kinds
     model.train(was_training)
-    all_rgb = torch.cat(rgb)
-    psnr = psnr_per_step(torch.cat(predicted_rgb), all_rgb[:, 1:])
-    scores: Scores = {
-        "psnr": psnr.tolist(),
-        "copy_psnr": psnr_per_step(all_rgb[:, :1].expand_as(all_rgb[:, 1:]), all_rgb[:, 1:]).tolist(),
-        "score": float(psnr.mean()),
-    }
+    ours, copied = _scored(kinds["zero"]), _scored(kinds["copy"])
+    psnr = _curve(ours, "psnr")
+    scores: Scores = {"psnr": psnr, "copy_psnr": _curve(copied, "psnr"), "score": fmean(psnr)}
     if not isinstance(model, T3VIP):
         return scores
-    all_depth, camera = torch.cat(depth), model.camera
-    depth_rmse = rmse_per_step(torch.cat(predicted_depth), all_depth[:, 1:])
-    depth_psnr = 20 * torch.log10((camera.far - camera.near) / depth_rmse.clamp(min=1e-9))
-    scores |= {
-        "depth_rmse": depth_rmse.tolist(),
-        "copy_depth_rmse": rmse_per_step(all_depth[:, :1].expand_as(all_depth[:, 1:]), all_depth[:, 1:]).tolist(),
-        "depth_psnr": depth_psnr.tolist(),
-        "inpainted": float(torch.cat(inpainted).mean()),
-        "score": float(psnr.mean() + depth_psnr.mean()),
-    }
-    if flows:
-        predicted, true, hand = (torch.cat(parts) for parts in zip(*flows, strict=True))
-        scores.update({name: value for name, value in flow_scores(predicted, true, hand).items() if isfinite(value)})
-    if tracked:
-        error, way = (torch.cat(parts) for parts in zip(*tracked, strict=True))
-        counts = way > MIN_WAY_M
-        if counts.any():
-            scores["tracking_error"] = float(error[counts].mean() / way[counts].mean())
-    return scores
+    rmse, span = _curve(ours, "depth_rmse"), model.camera.far - model.camera.near
+    depth_psnr = [20 * math.log10(span / max(error, 1e-9)) for error in rmse]
+    scores |= {"depth_rmse": rmse, "copy_depth_rmse": _curve(copied, "depth_rmse"), "depth_psnr": depth_psnr}
+    scores["score"] = fmean(psnr) + fmean(depth_psnr)
+    return scores | {name: ours[theirs] for name, theirs in _MEANS.items() if ours[theirs] is not None}
 
 
-def track_tcp(model: T3VIP, clips: Clips, tcp: Tensor, free: Rollout, context: int) -> tuple[Tensor, Tensor]:
-    """How far the TCP, moved by predicted transforms, is off at the clip's end, and how far it went, (B,) metres."""
-    points = clips.depth[:, context - 1] * model.rays
-    ends = []
-    for b in range(len(points)):
-        track = HandTrack.start(points[b], tcp[b, context - 1].to(points), model.intrinsics, 1)
-        for prediction in free.predictions[context - 1 :]:
-            assert isinstance(prediction, CloudPrediction)
-            track = track.advance(prediction.transform[b : b + 1], prediction.masks[b : b + 1, :1])
-        ends.append(track.tcp[0].cpu())
-    error = (torch.stack(ends) - tcp[:, -1]).norm(dim=1)
-    return error, (tcp[:, -1] - tcp[:, context - 1]).norm(dim=1)
+def _scored(statistics: Statistics) -> dict[str, Any]:
+    """Without intervals, as of one episode."""
+    return score_clips(statistics, np.zeros(len(statistics["se"]), np.int64))
+
+
+def _curve(scored: dict[str, Any], name: str) -> list[float]:
+    """One value per predicted step; NaN where it is no number."""
+    return [math.nan if value is None else value for value in scored["curves"][name]]
 
 
 def summary(scores: Scores) -> str:

@@ -123,8 +123,8 @@ def main(options: ViewOptions) -> None:
         )
         for name, model in models.items()
     ]
-    board = storyboard(clips, truth, options.context, shown)
-    scene = Scene(dataset.camera, clips, truth, options.context, board.frame_seconds, shown)
+    board = storyboard(clips, truth, options.context, shown, source.frame_seconds)
+    scene = Scene(dataset.camera, clips, truth, options.context, source.frame_seconds, shown)
     if options.sections:
         board = _only(board, options.sections)
     scale = options.scale or -(-TILE // dataset.camera.width)

@@ -32,7 +32,7 @@ from worldmodel.figure import TRUTH
 from worldmodel.metrics import MOVING_M
 from worldmodel.pictures import Shown
 from worldmodel.t3vip import T3VIP
-from worldmodel.tracking import HandTrack
+from worldmodel.tracking import tcp_way
 
 APPLICATION = "view-prediction"
 INSTALL = "pip install --constraint constraints.txt --editable '.[viewer]'"
@@ -244,11 +244,7 @@ def _tracks(scene: Scene) -> dict[str, NDArray[np.float64]]:
     for shown in scene.models:
         if not isinstance(shown.model, T3VIP):
             continue
-        device = shown.model.device
-        track = HandTrack.start(points.to(device), tcp[0].to(device), shown.model.intrinsics, 1)
-        way = [track.tcp[0].cpu().numpy()]
-        for cloud in shown.clouds[now:]:
-            track = track.advance(cloud.transform, cloud.masks[:, :1])
-            way.append(track.tcp[0].cpu().numpy())
-        tracks[shown.name] = camera.to_world(np.stack(way))
+        device, steps = shown.model.device, ((cloud.transform, cloud.masks[:, :1]) for cloud in shown.clouds[now:])
+        way = tcp_way(points.to(device), tcp[0].to(device), shown.model.intrinsics, steps)
+        tracks[shown.name] = camera.to_world(way.cpu().numpy())
     return tracks

@@ -56,12 +56,10 @@ class WorldState:
     """What a model knows: the current frame, seen or predicted, and its memory."""
 
     rgb: Tensor
+    """(B, 3, H, W) in [0, 1], float32."""
     depth: Tensor
+    """(B, 1, H, W) metres, float32; of a model that knows pictures only, that of the last frame seen."""
     memory: Memory
-
-    def expand(self, count: int) -> WorldState:
-        """The same state `count` times over, for that many candidate futures; the batch must be 1."""
-        return WorldState(expand(self.rgb, count), expand(self.depth, count), self.memory.expand(count))
 
 
 class WorldModel(nn.Module, ABC):
@@ -142,6 +140,11 @@ class WorldModel(nn.Module, ABC):
             raise UsageError(
                 f"rgb is {tuple(rgb.shape)} and depth {tuple(depth.shape)}; give (B, T, 3, H, W) and (B, T, 1, H, W)"
             )
+        if actions is not None and actions.shape[:2] != (batch, frames - 1):
+            raise UsageError(
+                f"actions are {tuple(actions.shape)} for {frames} frames; give ({batch}, {frames - 1}, A), "
+                "one for each gap between frames: aggregate_actions makes it of the actions of its control steps"
+            )
         memory = self.blank_memory(rgb[:, 0])
         for t in range(rgb.shape[1] - 1):
             action = None if actions is None else actions[:, t]
@@ -163,11 +166,14 @@ class WorldModel(nn.Module, ABC):
             action: (B, A) in the dataset's units; None is for action-free models.
             latent: (B, Z, H/8, W/8), zeros when None.
             paint, picture: see `predict`.
+
+        Returns:
+            The state at the next frame, of a batch of B, and what was predicted of it.
         """
         prediction, memory = self.predict(
             state.rgb, state.depth, action, latent, state.memory, paint=paint, picture=picture
         )
-        depth = state.depth if prediction.depth is None else prediction.depth
+        depth = expand(state.depth, len(prediction.rgb)) if prediction.depth is None else prediction.depth
         return WorldState(prediction.rgb, depth, memory), prediction
 
     def predict(

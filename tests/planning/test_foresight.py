@@ -1,11 +1,14 @@
 """What a model foresees, beside what the simulator does."""
 
 import json
+from copy import deepcopy
 
 import numpy as np
 import pytest
 
 from envs.errors import UsageError
+from planning import foresight
+from planning.controllers.kit import Kit
 from planning.foresight import Comparison, Config, main, random_plans
 
 
@@ -33,11 +36,24 @@ def test_ways_are_compared_by_how_far_they_truly_go():
     assert table["decisions"] == 1 and table["rank_correlation"] == pytest.approx(0.8)
 
 
-def test_the_command_compares_and_writes(tmp_path, capsys):
-    out = tmp_path / "new" / "foresight.json"
+def test_the_command_compares_and_writes(tmp_path, capsys, monkeypatch):
+    out, first_draws = tmp_path / "new" / "foresight.json", {"planner": set(), "plans": set()}
+    parts, plans = Kit.planning_parts, foresight.random_plans
+
+    def watched_parts(kit):
+        first_draws["planner"].add(deepcopy(kit.rng).random())
+        return parts(kit)
+
+    def watched_plans(rng, *options):
+        first_draws["plans"].add(deepcopy(rng).random())
+        return plans(rng, *options)
+
+    monkeypatch.setattr(Kit, "planning_parts", watched_parts)
+    monkeypatch.setattr(foresight, "random_plans", watched_plans)
     main(Config(episodes=1, decisions=2, plans=8, out=out))
     table = json.loads(out.read_text())
     assert sum(row["plans"] for row in table["ways"]) == 16
+    assert len(first_draws["plans"]) == 2 and not first_draws["plans"] & first_draws["planner"]
     assert "truly mm" in capsys.readouterr().out
 
 

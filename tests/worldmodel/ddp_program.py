@@ -12,10 +12,10 @@ import torch
 from data_collection.dataset import RGBDDataset
 from envs.errors import UsageError
 from worldmodel.clips import Clips, ClipSource
+from worldmodel.held_out import ValidationSet
 from worldmodel.ranks import Ranks, join_ranks
 from worldmodel.train import parse_options, train_with
 from worldmodel.trainer import Trainer
-from worldmodel.validation import ValidationSet
 
 sys.path.insert(0, str(Path(__file__).parent))
 

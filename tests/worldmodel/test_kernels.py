@@ -136,5 +136,21 @@ def test_latents_are_svtwops_alone_and_many_futures_share_one_past(clips, rival)
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("kind", RIVALS)
+def test_one_state_has_as_many_futures_as_it_is_given_actions(clips, rival, kind):
+    model = rival(kind)
+    state = model.observe(clips.rgb[:1, :2], clips.depth[:1, :2], clips.actions[:1, :1])
+    candidates = torch.randn((3, 2, 7), generator=torch.Generator().manual_seed(0))
+    many, alone = state, [state] * 3
+    for t in range(2):
+        many, together = model.step(many, candidates[:, t])
+        assert many.rgb.shape[0] == many.depth.shape[0] == 3
+        for n in range(3):
+            alone[n], prediction = model.step(alone[n], candidates[n : n + 1, t])
+            torch.testing.assert_close(together.rgb[n : n + 1], prediction.rgb, rtol=1e-4, atol=1e-4)
+    assert not torch.allclose(together.rgb[0], together.rgb[1], atol=1e-5)
+
+
+@torch.no_grad()
 def test_kernels_of_the_original_size_are_an_option(rival):
     assert rival("cdna", kernel_size=5).kernel_head.size == 5

@@ -11,12 +11,12 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from worldmodel.devices import prepare_devices
+from worldmodel.held_out import ValidationSet
 from worldmodel.inference import inference_network
 from worldmodel.objective import StepInputs, objective
 from worldmodel.options import PRESETS, Schedule
 from worldmodel.recording import Recorder, Recording, _kind
 from worldmodel.trainer import Trainer
-from worldmodel.validation import ValidationSet
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU that PyTorch can use is here")
 PHASES = Schedule(warmup=0.1, truth_until=0.5, posterior_from=0.3, kl_ramp=(0.3, 0.6), clip_lengths=((0.6, 4), (1, 5)))

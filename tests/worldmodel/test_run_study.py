@@ -15,17 +15,18 @@ import torch
 
 from data_collection.dataset import RGBDDataset
 from envs.command import parse, run
-from worldmodel import run_study, train
+from worldmodel import devices, evaluate, perceptual_weights, run_study, train
 from worldmodel.budget import Cost
 from worldmodel.checkpoint import load_model
 from worldmodel.clips import ClipSource
 from worldmodel.evaluate import EvaluationOptions
+from worldmodel.held_out import ValidationSet
+from worldmodel.perceptual_weights import WeightsUnavailable
 from worldmodel.rollout import unroll
-from worldmodel.study import paper, plan, training
+from worldmodel.study import paper, plan, report, training
 from worldmodel.study.findings import findings
 from worldmodel.study.options import StudyOptions
 from worldmodel.train import parse_options
-from worldmodel.validation import ValidationSet
 
 TINY = ["--preset", "tiny", "--samples", 0, "--clips", 4, "--no-vgg", "--device", "cpu"]
 HORIZONS = ["--horizons", 2, 3]
@@ -123,6 +124,12 @@ def test_two_models_are_trained_scored_and_put_beside_the_papers(study, data):
     assert "ours, Tabletop" in text and "paper, CALVIN" in text and "absolute values do not compare" in text
     assert all((study.out / picture).stat().st_size > 1000 for picture in ("curves.png", "bars.png"))
 
+    assert t3vip["training"]["machine"] == devices.describe(torch.device("cpu"))
+    for machine, words in (({"cpu": "Abacus", "cores": 10, "gpu": None}, "Abacus (10 cores)"), (None, "an unknown")):
+        other = {**cdna, "training": cdna["training"] | {"machine": machine}}
+        text = report.markdown(found | {"models": found["models"] | {"cdna-gap3": other}})
+        assert f"on {words}" in text and " for cdna-gap3 and " in text
+
     written = (study.out / "scores" / "cdna-gap3" / "evaluation.json").stat().st_mtime_ns
     assert study("--steps", 2, "--only", "cdna", "--gap", GAP)[2] == []  # done is done
     assert (study.out / "scores" / "cdna-gap3" / "evaluation.json").stat().st_mtime_ns == written
@@ -139,6 +146,30 @@ def test_two_models_are_trained_scored_and_put_beside_the_papers(study, data):
         assert code == 2 and not trained and all(word in err for word in words), err
     code, err, _ = study("--steps", 2, name="ablation")
     assert code == 2 and "holds the study 'table', not 'ablation'" in err
+
+
+def test_what_lacks_vgg_is_scored_again_once_its_weights_are_there(study, random_vgg, monkeypatch):
+    def gone():
+        raise WeightsUnavailable("there is no network")
+
+    cached = []
+    monkeypatch.setattr(evaluate, "load_weights", gone)
+    monkeypatch.setattr(perceptual_weights, "are_cached", lambda: bool(cached))
+    command = ["--steps", 1, "--only", "t3vip", "--gap", GAP, "--vgg", "--samples", 2]
+    assert study(*command)[::2] == (0, ["t3vip-gap3"])
+    assert "; best of 2 by PSNR over all frames for" in (study.out / "study.md").read_text()
+    scores = study.out / "scores" / "t3vip-gap3" / "evaluation.json"
+    written = scores.stat().st_mtime_ns
+    assert study(*command)[::2] == (0, []) and scores.stat().st_mtime_ns == written
+    monkeypatch.setattr(evaluate, "load_weights", lambda: random_vgg)
+    cached.append(True)
+    assert study(*command)[::2] == (0, [])
+    assert "; best of 2 by VGG over all frames for" in (study.out / "study.md").read_text()
+    found = document(study.out)["models"]
+    assert found["t3vip-gap3"]["curves"]["vgg"] and scores.stat().st_mtime_ns > written
+    other = {**found["t3vip-gap3"], "prediction": "best of 2 by PSNR"}
+    text = report.markdown(document(study.out) | {"models": found | {"sv2p-gap3": other}})
+    assert "best of 2 by VGG for t3vip-gap3 and best of 2 by PSNR for sv2p-gap3 over all frames" in text
 
 
 def test_models_are_trained_by_the_clock(study, monkeypatch):
@@ -312,6 +343,6 @@ def test_a_config_file_changes_the_options_of_all_models(study, data, tmp_path):
     for run_name in trained:
         options = json.loads((tmp_path / "study" / "models" / run_name / "config.json").read_text())
         assert (options["losses"]["depth"], options["learning_rate"]) == (0.2, 0.002)
-    report = (tmp_path / "study" / "study.md").read_text()
-    assert '{"losses": {"depth": 0.2}, "learning_rate": 0.002}' in report
+    written = (tmp_path / "study" / "study.md").read_text()
+    assert '{"losses": {"depth": 0.2}, "learning_rate": 0.002}' in written
     assert study("--config", tmp_path / "none.json")[0] == 2

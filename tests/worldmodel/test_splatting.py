@@ -163,6 +163,26 @@ def test_a_tenth_of_a_pixel_hides_a_tenth():
     assert column_7(0.1, "softmax", 5.0) > 0.8  # what mode `over` is for
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("sign", "edge"), [(-1, 0), (1, 7)])
+def test_a_near_layer_goes_on_hiding_as_it_leaves_the_picture(axis, sign, edge):
+    """The edge of a part of a picture looks as the same column, or row, of the whole one."""
+    whole = torch.full((1, 1, 8, 24), 2.0)
+    whole[..., slice(9, 12) if sign < 0 else slice(12, 15)] = 1.9
+
+    def seen(depth, shift, place):
+        depth = depth.mT if axis else depth
+        near = (depth < 2.0).float()
+        pixels = pixel_grid(*depth.shape[-2:])[None].clone()
+        pixels[:, axis] += sign * shift * near[:, 0]
+        return splat(near, pixels, depth, "over")[0].select(3 - axis, place)
+
+    for shift in (0.5, 0.9, 1.0, 1.02, 1.03, 1.3, 1.5, 1.9):
+        inside = seen(whole, shift, 8 + edge)
+        torch.testing.assert_close(seen(whole[..., 8:16], shift, edge), inside, atol=1e-4, rtol=0)
+        assert inside.min() > 0.49 and (shift < 1.0 or inside.min() > 0.96)
+
+
 def test_points_of_one_surface_share_a_pixel():
     assert column_7(0.5, "over", far=1.005) == pytest.approx((0.5 * 1 + 0.25) / 1.5, abs=1e-3)
 

@@ -1,5 +1,6 @@
 """Training learns, goes on exactly where it stopped, and survives frames that are no numbers."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,15 +8,17 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from data_collection.dataset import RGBDDataset
 from envs.errors import UsageError
 from worldmodel.clips import Clips, ClipSource
-from worldmodel.metrics import flow_scores
+from worldmodel.held_out import ValidationSet
+from worldmodel.journal import Journal
+from worldmodel.motion_scores import flow_statistics
 from worldmodel.options import PRESETS, Schedule
 from worldmodel.rollout import unroll
 from worldmodel.trainer import MAX_BAD_STEPS, Trainer
-from worldmodel.validation import ValidationSet
 
 
 @pytest.fixture
@@ -45,9 +48,12 @@ def test_a_run_that_was_stopped_ends_with_the_same_bits(make_trainer, precision,
             raise KeyboardInterrupt
         return update(self, clips)
 
+    closed, close = [], Journal.close
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(Trainer, "update", interrupted)
+        patch.setattr(Journal, "close", lambda self: (closed.append(self), close(self)))
         stopped.run()
+    assert len(closed) == 1
     torch.manual_seed(123)  # nothing may hang on the state of the global generator
     resumed = make_trainer("stopped", seed=0, **options)
     resumed.run()
@@ -58,6 +64,20 @@ def test_a_run_that_was_stopped_ends_with_the_same_bits(make_trainer, precision,
     assert resumed.step == 6 and resumed.best == straight.best
     before = checkpoint(straight.options.out, 3)
     assert not torch.equal(before["model.transforms.last.weight"], ours["model.transforms.last.weight"])
+
+
+def test_a_run_that_goes_on_keeps_all_that_was_told_up_to_there(tmp_path):
+    for start, steps in ((0, (1, 2, 3, 4)), (3, (4, 5))):  # the first was killed after its checkpoint of step 3
+        journal = Journal(tmp_path, start)
+        for step in steps:
+            journal.write("validation", step, {"score": 10.0 * start + step})
+        journal.close()
+    expected = [(1, 1.0), (2, 2.0), (3, 3.0), (4, 34.0), (5, 35.0)]
+    lines = [json.loads(line) for line in journal.path.read_text().splitlines()]
+    assert [(line["step"], line["score"]) for line in lines] == expected
+    board = EventAccumulator(str(tmp_path / "tensorboard"))
+    board.Reload()
+    assert [(event.step, event.value) for event in board.Scalars("validation/score")] == expected
 
 
 def test_it_learns_a_clip_by_heart_and_how_the_square_moves(make_trainer, tiny_dataset):
@@ -75,8 +95,8 @@ def test_it_learns_a_clip_by_heart_and_how_the_square_moves(make_trainer, tiny_d
         rollout = unroll(trainer.model.eval(), clips, 2, truth=1.0)
         rgb = (rollout.stack("rgb") - clips.rgb[:, 1:]).abs().mean()
         depth = (rollout.stack("depth") - clips.depth[:, 1:]).abs().mean()
-        flow = flow_scores(rollout.stack("scene_flow"), truth.scene_flow, truth.hand)["flow_error_moving"]
-        return float(rgb), float(depth), flow
+        flow = flow_statistics(rollout.stack("scene_flow"), truth.scene_flow, truth.hand)
+        return float(rgb), float(depth), float(flow["moving_error"] / flow["moving_length"])
 
     before = errors()
     for _ in range(trainer.options.steps):

@@ -3,7 +3,7 @@
 import json
 import sys
 from dataclasses import replace
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -134,6 +134,24 @@ def test_a_search_may_be_given_more_trials_where_they_hang_on_their_number_alone
     assert_one_line(tune_with("--trials", 4, "--searcher", "bohb"), "trials = 3, not 4", "another --out")
 
 
+def test_a_search_that_was_moved_goes_on_where_it_is(tune_with, monkeypatch, tmp_path):
+    """Ray's state holds the old place."""
+    assert tune_with()[0] == 130
+    (tune_with.out / "ray").mkdir()
+    (tmp_path / "link").symlink_to(tune_with.out)
+    assert tune_with(out=tmp_path / "link")[0] == 130 and (tune_with.out / "ray").exists()
+    moved = tune_with.out.rename(tmp_path / "moved")
+    assert tune_with(out=moved)[0] == 130 and not (moved / "ray").exists()
+    settings = json.loads((moved / "tune.json").read_text())
+    assert settings["out"] == str(moved)
+    monkeypatch.setattr(searchers, "check_searcher", lambda name: None)
+    settings["options"]["searcher"] = "bohb"
+    (moved / "tune.json").write_text(json.dumps(settings | {"out": "/before"}))
+    (moved / "ray").mkdir()
+    assert_one_line(tune_with("--searcher", "bohb", out=moved), "was begun in /before, where bohb", "another --out")
+    assert (moved / "ray").exists()
+
+
 def test_a_dataset_may_go_by_several_names(tune_with, write_dataset, monkeypatch, tmp_path):
     data, held_out = (write_dataset(tmp_path / name, [16, 16, 16], seed=seed) for seed, name in enumerate("dv"))
     assert tune_with("--validation", held_out, data=data)[0] == 130
@@ -231,6 +249,22 @@ def test_a_search_that_goes_on_remembers_its_rungs(tmp_path):
     scheduler = halving(results)
     scheduler.on_trial_add(None, ray_trial(1))
     assert tell(scheduler, 1, 1, 20.0) == STOP
+
+
+def test_bohb_hears_of_trials_that_diverged(monkeypatch):
+    """As of the worst score at the rung that they did not reach, or at the last."""
+    monkeypatch.setitem(sys.modules, "ConfigSpace", sys.modules.get("ConfigSpace", ModuleType("ConfigSpace")))
+    from worldmodel.tuning.bohb import BOHBSearch, TuneBOHB
+
+    told = []
+    monkeypatch.setattr(TuneBOHB, "on_trial_result", lambda self, trial, found: told.append((trial, found)))
+    monkeypatch.setattr(TuneBOHB, "on_trial_complete", lambda self, trial, found, error: None)
+    searcher = BOHBSearch.__new__(BOHBSearch)
+    searcher._budgets = (1, 3, 9)
+    for step, score, diverged in ((2, 30.0, False), (3, 31.0, False), (0, 0.0, True), (3, 0.0, True), (9, 0.0, True)):
+        searcher.on_trial_complete("a", {"step": step, "score": score, "diverged": diverged})
+    heard = [(found["hyperband_info"]["budget"], found["score"]) for _, found in told]
+    assert heard == [(3, 31.0), (1, 0.0), (9, 0.0), (9, 0.0)]
 
 
 def test_trials_that_died_too_often_are_tried_again(tune_with, monkeypatch):

@@ -24,6 +24,7 @@ from worldmodel.pictures import Shown, predict, storyboard
 from worldmodel.view_prediction import ViewOptions, labels, main
 
 EPISODE, FRAMES = 1, 5  # the longest of the tiny dataset, 20 frames
+FRAME_SECONDS = 0.1
 
 
 class Clip(NamedTuple):
@@ -81,7 +82,7 @@ def places(page, picture):
 
 def test_storyboard_has_what_each_model_knows(shown):
     _, clips, truth, both = shown
-    board = storyboard(clips, truth, 2, both)
+    board = storyboard(clips, truth, 2, both, FRAME_SECONDS)
     rows = [(strip.section, strip.source) for strip in board.strips]
     assert rows == [
         ("RGB", "truth"),
@@ -99,13 +100,16 @@ def test_storyboard_has_what_each_model_knows(shown):
         seen_too = strip.source == "truth" and strip.section in ("RGB", "depth")
         assert [picture is not None for picture in strip.pictures] == [seen_too] * 2 + [True] * 3, strip.section
     assert [row[1] for row in rows if row[0] == "occlusion"] == ["truth", "cloud"]
-    assert len(storyboard(clips, None, 2, both).strips) == len(rows) - 3
-    assert len(storyboard(clips, truth, 2, both[1:]).strips) == 5
+    assert len(storyboard(clips, None, 2, both, FRAME_SECONDS).strips) == len(rows) - 3
+    assert len(storyboard(clips, truth, 2, both[1:], FRAME_SECONDS).strips) == 5
 
 
 def test_storyboard_pictures_are_those_of_their_frame(shown, source):
     row, clips, truth, both = shown
-    strips = {(strip.section, strip.source): strip.pictures for strip in storyboard(clips, truth, 2, both).strips}
+    strips = {
+        (strip.section, strip.source): strip.pictures
+        for strip in storyboard(clips, truth, 2, both, FRAME_SECONDS).strips
+    }
     motion = ground_truth.motion(
         source.dataset.camera,
         clips.depth[0, 3, 0],
@@ -124,7 +128,7 @@ def test_storyboard_pictures_are_those_of_their_frame(shown, source):
 
 def test_figure_puts_every_picture_in_its_row_and_column(shown):
     _, clips, truth, both = shown
-    board = storyboard(clips, truth, 2, both)
+    board = storyboard(clips, truth, 2, both, FRAME_SECONDS)
     page = sheet(board, 2, 2)
     assert (page[:, 0] == 255).all() and (page[0] == 255).all()  # no text is cut off
     frames = [rgb_colours(clips.rgb[0, t]).repeat(2, 0).repeat(2, 1) for t in range(FRAMES)]
@@ -139,7 +143,7 @@ def test_figure_puts_every_picture_in_its_row_and_column(shown):
 
 def test_film_shows_all_frames_one_after_the_other(shown):
     _, clips, truth, both = shown
-    pages = list(film(storyboard(clips, truth, 2, both), 1))
+    pages = list(film(storyboard(clips, truth, 2, both, FRAME_SECONDS), 1))
     assert len(pages) == FRAMES and pages[0].shape[0] % 2 == pages[0].shape[1] % 2 == 0
     seen = places(pages[0], rgb_colours(clips.rgb[0, 0]))
     assert len(seen) == 5  # the truth, two models and two samples start from the same
@@ -154,6 +158,13 @@ def test_command_writes_figure_and_film(tiny_dataset, model_folder, rival_folder
     assert np.ptp(figure) == 255 and len(video) == 2 * (FRAMES + 2 * 5)  # at 5 frames a second, ends held for one
     assert np.abs(video[0].astype(float) - video[-1]).max() > 50
     assert sorted(path.name for path in out[0].parent.iterdir()) == ["a.mp4", "a.png"]
+
+
+def test_time_is_told_by_the_data(write_dataset, rival_folder, tmp_path):
+    """At half the control rate that the model was trained at, frames are twice as far apart."""
+    view(write_dataset(tmp_path / "slow", control_rate=15.0), [rival_folder], tmp_path / "a.mp4", "--scale", "1")
+    video = imageio.imread(tmp_path / "a.mp4")
+    assert len(video) == 4 * (FRAMES + 2 * 2)  # 2.5 frames a second, ends held for 2 frames
 
 
 def test_sections_can_be_chosen(tiny_dataset, model_folder, rival_folder, tmp_path, capsys):
@@ -241,9 +252,9 @@ def test_colours_mean_what_the_legends_say(shown):
     flow[0] = 0.043
     assert full_length(flow, 0.001) == pytest.approx(0.05)
     _, clips, truth, both = shown
-    unknown = storyboard(clips, None, 2, both).scales  # an untrained model's noise is no motion
+    unknown = storyboard(clips, None, 2, both, FRAME_SECONDS).scales  # an untrained model's noise is no motion
     assert unknown.scene_flow >= 0.01 and unknown.optical_flow >= 1.0
-    board = storyboard(clips, truth, 2, both)
+    board = storyboard(clips, truth, 2, both, FRAME_SECONDS)
     for section in board.sections:
         drawn = legend(section, board.scales, 128, 128)
         assert (drawn is None) == (section == "RGB")

@@ -48,26 +48,50 @@ def markdown(document: Document) -> str:
 def _protocol(document: Document) -> list[str]:
     data, settings, budget = document["data"], document["settings"], document["budget"]
     each = f"{budget['minutes']:g} minutes" if "minutes" in budget else f"{budget['steps']} steps"
-    machine = document["machine"]
     changed = f" with {json.dumps(settings['config'])}" if settings["config"] else ""
     samples = "latents at 0"
     if settings["samples"]:
-        samples = (
-            f"best of {settings['samples']} futures by {settings['select'].upper()} over all frames for models with "
-            "latents, one future for those without"
-        )
+        chosen = _chosen(document) or f"best of {settings['samples']} by {settings['select'].upper()}"
+        samples = f"{chosen} over all frames for models with latents, one future for those without"
+    machines = _machines(document)
+    place = f", on {machines}" if machines else ""
     return [
         f"**Ours**: trained on {data['train']['env_id']} ({data['train']['episodes']} episodes) for {each} each, one "
-        f"after the other, on {machine['gpu'] or machine['cpu']} ({machine['cores']} cores), preset "
-        f"`{settings['preset']}`{changed}, seed {settings['seed']}; the best model on {data['validation']['env_id']} "
-        f"({data['validation']['episodes']} other episodes) is tested on {data['test']['env_id']} "
-        f"({data['test']['episodes']} episodes, {settings['clips']} clips). {settings['context']} frames seen, "
-        f"{settings['horizons'][-1]} predicted, free running; {samples}. Shorter horizons are the first frames of the "
-        "same predictions. VGG is 1 - LPIPS.",
+        f"after the other{place}, preset `{settings['preset']}`{changed}, seed {settings['seed']}; the best model on "
+        f"{data['validation']['env_id']} ({data['validation']['episodes']} other episodes) is tested on "
+        f"{data['test']['env_id']} ({data['test']['episodes']} episodes, {settings['clips']} clips). "
+        f"{settings['context']} frames seen, {settings['horizons'][-1]} predicted, free running; {samples}. Shorter "
+        "horizons are the first frames of the same predictions. VGG is 1 - LPIPS.",
         "",
         "**The paper's** numbers stand beside ours for orders and gaps between models. They are of other data, 200,000 "
         "steps on a GPU, and best of 100 samples: absolute values do not compare.",
     ]
+
+
+def _chosen(document: Document) -> str:
+    """How the best of many futures was chosen, by the evaluations: VGG may have been missing from some."""
+    models = document["models"].items()
+    return _by_run({run: model["prediction"] for run, model in models if model["latents_zero"] is not None})
+
+
+def _machines(document: Document) -> str:
+    """What the models were trained on, by the runs, of which older ones do not say."""
+    machines = {run: model["training"]["machine"] for run, model in document["models"].items()}
+    return _by_run(
+        {
+            run: f"{m['gpu'] or m['cpu']} ({m['cores']} cores)" if m else "an unknown machine"
+            for run, m in machines.items()
+        }
+    )
+
+
+def _by_run(values: dict[str, str]) -> str:
+    """The value; where there are several, each with its runs."""
+    runs: dict[str, list[str]] = {}
+    for run, value in values.items():
+        runs.setdefault(value, []).append(run)
+    several = (f"{value} for {', '.join(of)}" for value, of in runs.items())
+    return " and ".join(several if len(runs) > 1 else runs)
 
 
 def _compared(document: Document, gap: int, horizon: str) -> list[str]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import platform
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +27,8 @@ def collect(options: StudyOptions) -> dict[str, Any]:
     """What is trained and scored of a study, in the order of the paper's table.
 
     Returns:
-        `models` by run name: `title`, `frame_gap`, `command`, `training`, `prediction` (how the scored prediction was
+        `models` by run name: `title`, `frame_gap`, `command`, `training` (with `machine`, None of a run that does not
+        say what it was trained on), `prediction` (how the scored prediction was
         made), `horizons` (by number of frames, each picture score), `latents_zero` (the same with latents at 0, where
         that is not what `horizons` has), `curves`, `intervals` (over all frames), `motion`, `latents` (their use) and
         `paper` (the paper's numbers, None where it gives none). `copy` by frame gap: `horizons`, `curves` and `motion`
@@ -75,7 +74,6 @@ def collect(options: StudyOptions) -> dict[str, Any]:
             "samples": options.samples,
             "select": options.select,
         },
-        "machine": _machine(),
         "paper": {str(gap): _setting(options, gap, env_id) for gap in sorted({c.gap for c in options.contestants})},
         "models": models,
         "copy": copies,
@@ -99,6 +97,7 @@ def _entry(
             "minutes": progress.seconds / 60,
             "best_step": origin["step"],
             "parameters": _parameters(model / WEIGHTS),
+            "machine": origin.get("machine"),
         },
         "prediction": scores["prediction"],
         "horizons": averages(scores, options.averaged),
@@ -148,13 +147,3 @@ def _setting(options: StudyOptions, gap: int, env_id: str) -> dict[str, Any] | N
 def _parameters(weights: Path) -> int:
     with safe_open(weights, "pt") as file:
         return sum(int(torch.Size(file.get_slice(name).get_shape()).numel()) for name in file.keys())  # noqa: SIM118
-
-
-def _machine() -> dict[str, Any]:
-    cpu = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [line.partition(":")[2].strip() for line in info.read_text().splitlines() if "model name" in line]
-        cpu = names[0] if names else cpu
-    gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
-    return {"cpu": cpu, "cores": os.cpu_count(), "gpu": gpu, "torch": torch.__version__}

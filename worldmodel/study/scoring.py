@@ -8,8 +8,9 @@ from typing import Any
 from data_collection.dataset import RGBDDataset
 from envs.errors import UsageError
 from envs.files import write_json
-from worldmodel import evaluate
+from worldmodel import evaluate, perceptual_weights
 from worldmodel.checkpoint import content_hashes
+from worldmodel.perceptual import SMALLEST
 from worldmodel.scores import PICTURE_SCORES
 from worldmodel.study.options import StudyOptions
 from worldmodel.study.plan import Contestant
@@ -40,14 +41,19 @@ def check_lengths(options: StudyOptions) -> None:
 
 
 def scores_of(options: StudyOptions, contestant: Contestant) -> dict[str, Any] | None:
-    """A contestant's evaluation.json, if it is of this model, on this test data, by this protocol; else None."""
+    """A contestant's evaluation.json, if it is of this model, on this test data, by this protocol; else None.
+
+    Where it was to be scored by VGG and the weights were not to be had, it counts until they are there.
+    """
     folder = options.out / "scores" / contestant.run
     try:
         protocol = json.loads((folder / _PROTOCOL).read_text())
         evaluation: dict[str, Any] = json.loads((folder / _EVALUATION).read_text())
     except (OSError, ValueError):
         return None
-    return evaluation if protocol == _protocol(options, contestant) else None
+    if protocol != _protocol(options, contestant):
+        return None
+    return None if _lacks_vgg(options, evaluation) and perceptual_weights.are_cached() else evaluation
 
 
 def score(options: StudyOptions, contestant: Contestant) -> dict[str, Any]:
@@ -92,6 +98,12 @@ def averages(entry: dict[str, Any], horizons: tuple[int, ...]) -> dict[str, dict
         }
         for horizon in horizons
     }
+
+
+def _lacks_vgg(options: StudyOptions, evaluation: dict[str, Any]) -> bool:
+    camera = RGBDDataset(options.test).camera
+    wanted = options.vgg and min(camera.height, camera.width) >= SMALLEST
+    return wanted and "vgg" not in evaluation["models"]["copy"]["curves"]
 
 
 def _whole(curve: list[float | None] | None, horizon: int) -> bool:

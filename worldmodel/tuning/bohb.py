@@ -32,9 +32,12 @@ class BOHBSearch(TuneBOHB):
         return True
 
     def on_trial_result(self, trial_id: str, result: dict[str, Any]) -> None:
-        """Learn from a score at a rung."""
-        if result["step"] in self._budgets:
-            super().on_trial_result(trial_id, {**result, "hyperband_info": {"budget": result["step"]}})
+        """Learn from a score at a rung; a trial that diverged has the worst one at the rung that it did not reach."""
+        step = result["step"]
+        if result["diverged"]:
+            step = min((budget for budget in self._budgets if budget > step), default=self._budgets[-1])
+        if step in self._budgets:
+            super().on_trial_result(trial_id, {**result, "hyperband_info": {"budget": step}})
 
     def on_trial_complete(self, trial_id: str, result: dict[str, Any] | None = None, error: bool = False) -> None:
         """Learn from the last score, which Ray tells here alone."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import rankdata, spearmanr
 
+from worldmodel.scores import number
 from worldmodel.tuning.journal import Trial
 
 FEWEST = 3
@@ -36,7 +37,7 @@ def rank_correlations(trials: Sequence[Trial], budgets: Sequence[int]) -> list[d
         r = p = math.nan
         if len(both) >= FEWEST:
             r, p = _spearman([t.scores[low] for t in both], [t.scores[high] for t in both])
-        pairs.append({"budgets": [low, high], "r": _number(r), "p": _number(p), "n": len(both)})
+        pairs.append({"budgets": [low, high], "r": number(float(r)), "p": number(float(p)), "n": len(both)})
     return pairs
 
 
@@ -60,7 +61,3 @@ def _exact_p(first: Any, second: Any) -> float:
     first = first - first.mean()
     orders = np.array(list(itertools.permutations(second)))
     return float(np.mean(abs(orders @ first) >= abs(second @ first) - 1e-9))
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

@@ -12,12 +12,12 @@ from data_collection.ray_cluster import connect
 from envs.errors import UsageError
 from envs.files import write_json
 from worldmodel.clips import ClipSource
+from worldmodel.held_out import ValidationSet
 from worldmodel.train import HOW_NOT_WHAT, changes, document_of
 from worldmodel.training_data import open_data, settled
 from worldmodel.tuning import journal
 from worldmodel.tuning.options import TuneOptions
 from worldmodel.tuning.space import axes_of, point_of
-from worldmodel.validation import ValidationSet
 
 SETTINGS, RAY = "tune.json", "ray"
 QUIET = {
@@ -33,14 +33,16 @@ Data = tuple[ClipSource, ValidationSet]
 def settle(options: TuneOptions) -> Data:
     """Open the data, and write down what is searched, or see that it is what the folder's search was begun with.
 
-    Where a configuration hangs on its number alone, more trials may be asked for than at the beginning.
+    Where a configuration hangs on its number alone, more trials may be asked for than at the beginning, and the folder
+    may have been moved or copied.
 
     Raises:
-        UsageError: the data does not do, or the folder holds another search.
+        UsageError: the data does not do, the folder holds another search, or one that cannot go on in another place.
     """
     training = settled(options.training)
     data = open_data(training)
     document: dict[str, Any] = {
+        "out": str(options.out.resolve()),
         "options": options.document(),
         "retries": options.retries,
         "training": document_of(training),
@@ -63,6 +65,7 @@ def settle(options: TuneOptions) -> Data:
         same_ranges = before["axes"] == document["axes"]
         if more and same_ranges:
             before["options"]["trials"] = options.trials
+        place = before.get("out", document["out"])
         other_retries = before.get("retries", options.retries) != options.retries
         what = {name: value for name, value in document["training"].items() if name not in HOW_NOT_WHAT}
         groups = {"options": document["options"], "training": what, "data": document["data"]}
@@ -78,9 +81,15 @@ def settle(options: TuneOptions) -> Data:
             f"{options.out} holds a search with {'; '.join(found)}; give the same options to go on with it, or another "
             "--out"
         )
-    if more or other_retries:
-        if (options.out / RAY).exists():
-            shutil.rmtree(options.out / RAY)  # it keeps to the old numbers; trials go on from their own folders
+    moved = place != document["out"]
+    if moved and not repeatable and (options.out / RAY).exists():
+        raise UsageError(
+            f"{options.out} holds a search that was begun in {place}, where {options.searcher} would go on writing; "
+            "put the folder back there, or give another --out"
+        )
+    if more or other_retries or moved:
+        if (options.out / RAY).exists():  # it keeps to the old numbers and place; trials go on from their own folders
+            shutil.rmtree(options.out / RAY)
         write_json(path, document)
     return data
 

@@ -17,6 +17,7 @@ from ray import tune
 from envs.errors import UsageError
 from worldmodel.clips import ClipSource
 from worldmodel.devices import find_device, prepare_devices
+from worldmodel.held_out import ValidationSet
 from worldmodel.memory import keep_freed_memory
 from worldmodel.options import TrainOptions
 from worldmodel.ranks import Ranks
@@ -24,7 +25,7 @@ from worldmodel.train import claim, existing_run, make_trainer
 from worldmodel.trainer import Diverged
 from worldmodel.tuning.journal import PARTS
 from worldmodel.tuning.space import at_point
-from worldmodel.validation import Scores, ValidationSet
+from worldmodel.validation import Scores
 
 WORST_DB = 0.0
 """The score of a trial that diverged: below that of any picture."""
