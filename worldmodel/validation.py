@@ -70,8 +70,9 @@ def summary(scores: Scores) -> str:
     psnr, copy = _steps(scores["psnr"]), _steps(scores["copy_psnr"])
     line = f"PSNR {psnr[0]:.1f} ({psnr[0] - copy[0]:+.1f}) to {psnr[-1]:.1f} ({psnr[-1] - copy[-1]:+.1f} dB over copy)"
     if "depth_rmse" in scores:
-        share = _steps(scores["depth_rmse"])[-1] / _steps(scores["copy_depth_rmse"])[-1]
-        line += f", depth RMSE {share:.2f} of copying's, inpainted {100 * float(scores['inpainted']):.1f} %"  # type: ignore[arg-type]
+        ours, copied = _steps(scores["depth_rmse"])[-1], _steps(scores["copy_depth_rmse"])[-1]
+        line += f", depth RMSE {ours / copied:.2f} of copying's" if copied > 0 else f", depth RMSE {ours:.3f} m"
+        line += f", inpainted {100 * float(scores['inpainted']):.1f} %"  # type: ignore[arg-type]
     if "flow_error_moving" in scores:
         line += f", flow error {scores['flow_error_moving']:.2f}"
     if "flow_error_hand" in scores:

@@ -18,6 +18,9 @@ from worldmodel.config import ModelConfig, ModelContext
 from worldmodel.lending import WeightLoan
 from worldmodel.trunk import STRIDE, Encoder, Skips
 
+BRIGHTEST = 2.0
+"""Colours beyond this are not in [0, 1], whatever noise is on them."""
+
 
 def expand(x: Tensor, count: int) -> Tensor:
     """A batch of one as a batch of `count`, without copying."""
@@ -133,12 +136,17 @@ class WorldModel(nn.Module, ABC):
             The state at the last frame.
 
         Raises:
-            UsageError: the shapes are others.
+            UsageError: the shapes are others, or colours are not in [0, 1].
         """
         batch, frames, _, height, width = rgb.shape if rgb.dim() == 5 else (0,) * 5
         if frames < 1 or rgb.shape[2] != 3 or depth.shape != (batch, frames, 1, height, width):
             raise UsageError(
                 f"rgb is {tuple(rgb.shape)} and depth {tuple(depth.shape)}; give (B, T, 3, H, W) and (B, T, 1, H, W)"
+            )
+        if not (rgb.is_floating_point() and depth.is_floating_point()) or rgb.max() > BRIGHTEST:
+            raise UsageError(
+                f"rgb is {rgb.dtype} up to {float(rgb.max()):g} and depth {depth.dtype}; give floats, colours in [0, 1]"
+                " and metres"
             )
         if actions is not None and actions.shape[:2] != (batch, frames - 1):
             raise UsageError(

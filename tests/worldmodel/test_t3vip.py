@@ -319,6 +319,9 @@ def test_frames_of_other_shapes_are_refused(model, clips):
     ):
         with pytest.raises(UsageError, match=r"^rgb is \(.*; give \(B, T, 3, H, W\) and \(B, T, 1, H, W\)"):
             model.observe(pictures, depths, clips.actions[:, :1])
+    for pictures in ((255 * rgb).to(torch.uint8), 255 * rgb):
+        with pytest.raises(UsageError, match=r"^rgb is torch.* up to .*; give floats, colours in \[0, 1\] and metres"):
+            model.observe(pictures, depth, clips.actions[:, :1])
     for actions in (clips.actions[:, :2], clips.actions[:, :0], clips.actions[:1, :1], clips.actions[:, 0]):
         with pytest.raises(UsageError, match=r"^actions are \(.* for 2 frames; give \(3, 1, A\).*aggregate_actions"):
             model.observe(rgb, depth, actions)

@@ -39,6 +39,12 @@ def test_what_nothing_moves_for_has_no_score(make_model, validation, monkeypatch
     assert "false flow" in summary(scores) and "nan" not in summary(scores)
 
 
+def test_depth_that_stays_has_no_share_of_copyings(make_model, validation):
+    scores = validate(make_model(), validation)
+    still = scores | {"copy_depth_rmse": [0.0] * 3, "depth_rmse": [0.25] * 3}
+    assert "of copying's" in summary(scores) and "depth RMSE 0.250 m" in summary(still)
+
+
 def test_without_transforms_the_scores_are_those_of_copying(make_model, validation, monkeypatch):
     model = make_model()
     moving, predict = validate(model, validation), model.predict
