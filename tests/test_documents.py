@@ -225,7 +225,7 @@ def test_imports_attributes_and_arguments_of_python_exist(document):
             if isinstance(node, ast.Attribute):
                 resolved(node, names)
             called = resolved(node.func, names) if isinstance(node, ast.Call) else None
-            if called is not None and called.__module__.startswith(PACKAGES):
+            if str(getattr(called, "__module__", None)).startswith(PACKAGES):
                 given = {word.arg: None for word in node.keywords if word.arg}
                 unpacked = any(word.arg is None for word in node.keywords)  # `**` may hold what is missing
                 signature = inspect.signature(called)

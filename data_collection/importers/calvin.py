@@ -100,8 +100,9 @@ class CalvinSource:
                 check_array(frame[key], f"{key} of {name}", kind, shape)
             rgb[row] = average_colour(frame["rgb_static"], height, width)
             metres = nearest_depth(frame["depth_static"], height, width) * self.depth_scale
-            depth_check.look(metres)
-            depth[row] = quantise_depth(metres, self.camera.near, self.camera.far)
+            depth_check.look(metres)  # which says of the whole episode whether these are metres
+            within = np.clip(metres, self.camera.near, self.camera.far)
+            depth[row] = quantise_depth(within, self.camera.near, self.camera.far)
             for key, values in flat.items():
                 values[row] = frame[key]
         notes = depth_check.notes()

@@ -89,8 +89,9 @@ class PngFolders(ABC):
             check_array(raw, files["depthsub"][row].name, "uint16", shape)
             rgb[row] = average_colour(colour, height, width)
             metres = nearest_depth(raw, height, width) * (self.png_far * self.depth_scale / DEPTH_STEPS)
-            depth_check.look(metres)
-            depth[row] = quantise_depth(metres, self.camera.near, self.camera.far)
+            depth_check.look(metres)  # which says of the whole episode whether these are metres
+            within = np.clip(metres, self.camera.near, self.camera.far)
+            depth[row] = quantise_depth(within, self.camera.near, self.camera.far)
         actions, proprio, notes = self.robot(part.folder, files, count)
         columns: Columns = {
             "rgb": rgb,
