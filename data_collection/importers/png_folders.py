@@ -81,27 +81,26 @@ class PngFolders(ABC):
         ceiling = 0.999 * self.png_far * self.depth_scale
         depth_check = DepthCheck(self.camera, self.expected_m, misreadings, self.depth_scale, ceiling)
         rgb = np.empty((count, height, width, 3), np.uint8)
-        depth = np.empty((count, height, width), np.uint16)
+        metres = np.empty((count, height, width))
         shape = (self.stored.height, self.stored.width)
         for row in range(count):
             colour, raw = _read_png(files["rgbsub"][row]), _read_png(files["depthsub"][row])
             check_array(colour, files["rgbsub"][row].name, "uint8", (*shape, 3))
             check_array(raw, files["depthsub"][row].name, "uint16", shape)
             rgb[row] = average_colour(colour, height, width)
-            metres = nearest_depth(raw, height, width) * (self.png_far * self.depth_scale / DEPTH_STEPS)
-            depth_check.look(metres)  # which says of the whole episode whether these are metres
-            within = np.clip(metres, self.camera.near, self.camera.far)
-            depth[row] = quantise_depth(within, self.camera.near, self.camera.far)
-        actions, proprio, notes = self.robot(part.folder, files, count)
+            metres[row] = nearest_depth(raw, height, width) * (self.png_far * self.depth_scale / DEPTH_STEPS)
+            depth_check.look(metres[row])
+        actions, proprio, robot_notes = self.robot(part.folder, files, count)
+        notes = (*depth_check.notes(), *robot_notes)
         columns: Columns = {
             "rgb": rgb,
-            "depth": depth,
+            "depth": quantise_depth(metres, self.camera.near, self.camera.far),
             "action": actions_of_episode(actions),
             "proprio": proprio.astype(np.float32),
             "state": proprio.astype(np.float64),
             "reward": np.zeros(count, np.float32),
         }
-        return Episode(columns, (*depth_check.notes(), *notes))
+        return Episode(columns, notes)
 
     @abstractmethod
     def robot(

@@ -19,8 +19,8 @@ from planning.observations import Observation
 
 __all__ = ["Controller", "Goal", "HoldingController", "Observation", "PlanningController", "held_gripper"]
 
-
 GOAL_NUMBERS = {"point_world": 3, "pixel": 2}
+"""How many numbers a goal has, by what a controller knows of it."""
 
 
 class Controller(Protocol):
