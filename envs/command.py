@@ -94,13 +94,13 @@ def parse(
         UsageError: they do not parse, one that takes several values is given more than once, or `config` refuses them.
     """
     box, about = io.StringIO(), inspect.getdoc(config)
-    given = sys.argv[1:] if args is None else args
-    _refuse_repeats(config, given)
+    words = sys.argv[1:] if args is None else args
+    _refuse_repeats(config, words)
     try:
         with contextlib.redirect_stderr(box):
             if default is None:
-                return tyro.cli(config, args=given, description=about)
-            return tyro.cli(config, args=given, description=about, default=default(given))
+                return tyro.cli(config, args=words, description=about)
+            return tyro.cli(config, args=words, description=about, default=default(words))
     except SystemExit as stop:
         if stop.code != 2:  # --help
             raise
@@ -108,6 +108,16 @@ def parse(
         while cause is not None and not isinstance(cause, UsageError):
             cause = cause.__context__
     raise cause or UsageError(_one_line(box.getvalue()))
+
+
+def given(arguments: Sequence[str], option: str) -> str | None:
+    """What follows an option on a command line that is not parsed yet; None where it does not stand."""
+    value = None
+    for here, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        name, separator, joined = here.partition("=")
+        if name == option:
+            value = joined if separator else following
+    return value
 
 
 def _refuse_repeats(config: type[Any], given: Sequence[str]) -> None:

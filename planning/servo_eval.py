@@ -268,14 +268,9 @@ def usual_options(arguments: Sequence[str]) -> ServoConfig:
     Raises:
         UsageError: there is no such task.
     """
-    named: dict[str, str] = {}
-    for here, following in zip(arguments, [*arguments[1:], ""], strict=True):
-        option, separator, value = here.partition("=")
-        if option in ("--env", "--point"):
-            named[option[2:]] = value if separator else following
-    env = named.get("env", "tabletop")
+    env = envs.command.given(arguments, "--env") or "tabletop"
     points = [point for known, point in TASKS if known == env]
-    point = named.get("point", points[0] if points else "")
+    point = envs.command.given(arguments, "--point") or (points[0] if points else "")
     if point not in points:
         known = ", ".join(f"--env {env} --point {point}" for env, point in TASKS)
         raise UsageError(f"nothing is known of --env {env} --point {point or 'object'}; there is {known}")

@@ -187,3 +187,12 @@ PRESETS: dict[str, TrainOptions] = {
         log_every=1,
     ),
 }
+
+
+def preset_for(name: str, model: str) -> TrainOptions:
+    """A preset's options for a model. CDNA, SNA and SV2P learn from squared errors, as in their papers: with absolute
+    ones they keep copying for long wherever little moves."""
+    options = PRESETS[name]
+    if model.startswith("t3vip"):
+        return options
+    return replace(options, losses=replace(options.losses, power=2))

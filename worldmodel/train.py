@@ -21,7 +21,7 @@ from worldmodel.devices import describe, find_device, find_precision, prepare_de
 from worldmodel.held_out import ValidationSet
 from worldmodel.memory import keep_freed_memory
 from worldmodel.models import make_model, named_config
-from worldmodel.options import PRESETS, TrainOptions
+from worldmodel.options import PRESETS, TrainOptions, preset_for
 from worldmodel.ranks import Ranks, join_ranks
 from worldmodel.trainer import Trainer
 from worldmodel.training_data import model_context, open_data, settled
@@ -166,28 +166,19 @@ def document_of(options: TrainOptions) -> dict[str, Any]:
 
 
 def _preset(arguments: Sequence[str]) -> TrainOptions:
-    """The options that hold where the command line is silent: those of its preset, changed by its --config."""
-    path = _given(arguments, "--config")
+    """The options that hold where the command line is silent: those of its preset for its model, changed by its
+    --config."""
+    path = command_line.given(arguments, "--config")
     values = {} if path is None else read_config(Path(path))
-    if _given(arguments, "--steps") is not None:  # they take the file's time's place
-        if _given(arguments, "--minutes") not in (None, "None"):
+    if command_line.given(arguments, "--steps") is not None:  # they take the file's time's place
+        if command_line.given(arguments, "--minutes") not in (None, "None"):
             raise UsageError("--steps and --minutes are both given; give one of them")
         values.pop("minutes", None)
-    name = _given(arguments, "--preset") or values.pop("preset", "cpu")
+    name = command_line.given(arguments, "--preset") or values.pop("preset", "cpu")
     if not isinstance(name, str) or name not in PRESETS:
         raise UsageError(f"no preset '{name}'; there are {', '.join(PRESETS)}")
-    return PRESETS[name] if path is None else changed(PRESETS[name], values | {"preset": name}, path)
-
-
-def _given(arguments: Sequence[str], option: str) -> str | None:
-    """What follows an option on the command line."""
-    value = None
-    for here, following in zip(arguments, [*arguments[1:], ""], strict=True):
-        if here == option:
-            value = following
-        elif here.startswith(f"{option}="):
-            value = here.split("=", 1)[1]
-    return value
+    options = preset_for(name, str(command_line.given(arguments, "--model") or values.get("model", "t3vip")))
+    return options if path is None else changed(options, values | {"preset": name}, path)
 
 
 def command() -> None:

@@ -56,6 +56,18 @@ def test_the_config_of_a_run_makes_the_same_run(options_with):
     assert document_of(again) == document_of(ours) and again.data == ours.data and again.batch == 3
 
 
+def test_rivals_learn_from_squared_errors_unless_told_otherwise(options_with):
+    def power(*arguments, file=None):
+        return options_with(file or {}, *arguments).losses.power
+
+    assert [power("--model", name) for name in ("t3vip", "t3vip-d", "sv2p", "sna", "cdna")] == [1, 1, 2, 2, 2]
+    assert power("--model=cdna", "--preset=tiny") == 2 and power("--model=cdna", "--losses.power", "1") == 1
+    assert power() == 1 and parse_options(["--data", "d", "--out", "o", "--model", "sna"]).losses.power == 2
+    assert power(file={"model": "cdna"}) == 2 and power("--model", "t3vip", file={"model": "cdna"}) == 1
+    assert power("--model", "cdna", file={"losses": {"power": 1}}) == 1
+    assert power("--model", "cdna", file={"losses": {"rgb": 0.7}}) == 2
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [
