@@ -37,7 +37,8 @@ class LossWeights:
     """lambda_6, divergence of the latents from the prior, nats a pixel. With 1e-3 latents told the model how
     everything moves, and it did not learn that from the actions. (The reference's is of a unit 512 times larger.)"""
     power: Literal[1, 2] = 1
-    """alpha: 1 for absolute, 2 for squared reconstruction errors. By default 1 for T3VIP and 2 for its rivals."""
+    """alpha: 1 for absolute, 2 for squared reconstruction errors. `train-worldmodel` takes 2 for CDNA, SNA
+    and SV2P where none is given."""
     alignment: Literal["knn", "chamfer"] = "knn"
     """Where a point's nearest neighbour is sought: in a window about its pixel, or (Hind4sight-Net's chamfer distance)
     in the whole cloud, which takes many times longer."""

@@ -91,7 +91,7 @@ class CalvinSource:
         }
         depth_check = DepthCheck(self.camera, self.recording.distance, MISREADINGS, self.depth_scale)
         rgb = np.empty((part.frames, height, width, 3), np.uint8)
-        metres = np.empty((part.frames, height, width))
+        raw = []  # depth as it is stored: an episode's metres would take twice the memory
         flat = {name: np.empty((part.frames, *shape), np.float64) for name, (_, shape) in list(shapes.items())[2:]}
         for row in range(part.frames):
             name = f"episode_{part.first + row:07d}.npz"
@@ -99,12 +99,13 @@ class CalvinSource:
             for key, (kind, shape) in shapes.items():
                 check_array(frame[key], f"{key} of {name}", kind, shape)
             rgb[row] = average_colour(frame["rgb_static"], height, width)
-            metres[row] = nearest_depth(frame["depth_static"], height, width) * self.depth_scale
-            depth_check.look(metres[row])
+            raw.append(nearest_depth(frame["depth_static"], height, width))
+            depth_check.look(raw[-1] * self.depth_scale)
             for key, values in flat.items():
                 values[row] = frame[key]
         notes = depth_check.notes()
-        depth = quantise_depth(metres, self.camera.near, self.camera.far)
+        near, far = self.camera.near, self.camera.far
+        depth = np.stack([quantise_depth(one * self.depth_scale, near, far) for one in raw])
         return Episode(*_columns(rgb, depth, flat, notes))
 
 

@@ -81,20 +81,22 @@ class PngFolders(ABC):
         ceiling = 0.999 * self.png_far * self.depth_scale
         depth_check = DepthCheck(self.camera, self.expected_m, misreadings, self.depth_scale, ceiling)
         rgb = np.empty((count, height, width, 3), np.uint8)
-        metres = np.empty((count, height, width))
+        steps = []  # depth as it is stored: an episode's metres would take four times the memory
+        step = self.png_far * self.depth_scale / DEPTH_STEPS
         shape = (self.stored.height, self.stored.width)
         for row in range(count):
             colour, raw = _read_png(files["rgbsub"][row]), _read_png(files["depthsub"][row])
             check_array(colour, files["rgbsub"][row].name, "uint8", (*shape, 3))
             check_array(raw, files["depthsub"][row].name, "uint16", shape)
             rgb[row] = average_colour(colour, height, width)
-            metres[row] = nearest_depth(raw, height, width) * (self.png_far * self.depth_scale / DEPTH_STEPS)
-            depth_check.look(metres[row])
+            steps.append(nearest_depth(raw, height, width))
+            depth_check.look(steps[-1] * step)
         actions, proprio, robot_notes = self.robot(part.folder, files, count)
         notes = (*depth_check.notes(), *robot_notes)
+        near, far = self.camera.near, self.camera.far
         columns: Columns = {
             "rgb": rgb,
-            "depth": quantise_depth(metres, self.camera.near, self.camera.far),
+            "depth": np.stack([quantise_depth(one * step, near, far) for one in steps]),
             "action": actions_of_episode(actions),
             "proprio": proprio.astype(np.float32),
             "state": proprio.astype(np.float64),
