@@ -93,7 +93,7 @@ def difference_table(entries: Mapping[str, Mapping[str, Any]]) -> str:
     return aligned(rows)
 
 
-def comparison_chart(models: Mapping[str, Mapping[str, Any]], path: Path, title: str) -> None:
+def success_chart(models: Mapping[str, Mapping[str, Any]], path: Path, title: str) -> None:
     """Draw success in 2D and 3D, and both by parts of the setups, as a PNG.
 
     Where the setups differ by the share of the way along the optical axis, both are drawn against that share.

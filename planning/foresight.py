@@ -134,15 +134,15 @@ def compare(config: Config) -> dict[str, Any]:
     """The table of `Comparison`."""
     task = TASKS[config.env, config.point]
     env = task.make_env(task.scenes[0], 64)
-    kit = Kit(env, task.planner, checkpoints={} if config.checkpoint is None else {"t3vip": config.checkpoint})
-    kit.body, kit.surface, kit.reach = task.body, task.surface, task.reach
+    given = {} if config.checkpoint is None else {"t3vip": config.checkpoint}
+    kit = Kit(env, task.planner, checkpoints=given, body=task.body, surface=task.surface, reach=task.reach)
     found, rng = Comparison(), np.random.default_rng(np.random.SeedSequence((PLAN_ENTROPY, config.seed)))
     try:
         model = kit.model("t3vip")
         hold = model.frame_gap
         for index in tqdm(range(config.episodes), desc="foresight", unit="episode"):
             setup = task.make_setup(env, index, config.seed)
-            kit.mark, kit.rng = mark_of(setup), np.random.default_rng((config.seed, index))
+            kit.begin(mark_of(setup), np.random.default_rng((config.seed, index)))
             oracle = OracleController(kit.simulator, kit.mark, hold=hold, **kit.planning_parts())
             onlooker = Onlooker(model, kit.camera, **kit.planning_parts())
             observation, goal = setup.start(env), setup.goal.point_world

@@ -1,16 +1,13 @@
-"""What an evaluation comes to: the table, `servo.json`, and the bar chart."""
+"""What an evaluation comes to: the table and `servo.json`."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from envs.files import written_aside
 from planning.episode import Record
 from planning.statistics import wilson_interval
 
@@ -133,35 +130,3 @@ def _percent(share: float | None) -> str:
 
 def _interval(interval: Sequence[float]) -> str:
     return f"{100 * interval[0]:.0f}-{100 * interval[1]:.0f}"
-
-
-def bar_chart(models: dict[str, dict[str, Any]], path: Path, title: str) -> None:
-    """Draw success in 2D and 3D, and 3D success by the parts of the setups, with 95 % intervals, as a PNG."""
-    figure = Figure(figsize=(4 + 1.6 * len(models), 3.8), layout="constrained")
-    overall, split = figure.subplots(1, 2, sharey=True)
-    _bars(overall, models, {"2D": lambda m: (m, "2d"), "3D": lambda m: (m, "3d")}, ("#9bb7d4", "#1f4e79"))
-    parts = parts_of(next(iter(models.values())))
-    sides = {TITLES[part]: lambda entry, part=part: (parts_of(entry)[part], "3d") for part in parts}
-    _bars(split, models, sides, ("#b9d8b4", "#2f6b2a"))
-    overall.set_ylabel("success [%]")
-    overall.set_title(title, fontsize=10)
-    by_way = tuple(parts) == AXIS_PARTS
-    split.set_title("3D, by the direction of the way" if by_way else "3D, by what there is to do", fontsize=10)
-    with written_aside(path) as aside:
-        figure.savefig(aside, format="png", dpi=150)
-
-
-def _bars(axes: Any, models: dict[str, dict[str, Any]], series: dict[str, Any], colours: Sequence[str]) -> None:
-    width = 0.8 / len(series)
-    for i, (label, pick) in enumerate(series.items()):
-        parts = [pick(entry) for entry in models.values()]
-        height = np.array([100 * (part[f"success_{space}"] or 0) for part, space in parts])
-        low, high = 100 * np.array([part[f"success_{space}_interval"] for part, space in parts]).T
-        places = np.arange(len(models)) + (i - (len(series) - 1) / 2) * width
-        errors = np.clip([height - low, high - height], 0, None)
-        axes.bar(places, height, 0.92 * width, yerr=errors, capsize=3, label=label, color=colours[i])
-    axes.set_xticks(range(len(models)), list(models))
-    axes.set_ylim(0, 105)
-    axes.grid(axis="y", alpha=0.3)
-    axes.set_axisbelow(True)
-    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=len(series), frameon=False)

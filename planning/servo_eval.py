@@ -16,14 +16,14 @@ from tqdm import tqdm
 import envs.command
 from envs.errors import UsageError
 from envs.files import locked, write_json
-from planning.comparison import comparison_chart, difference_table, differences
+from planning.comparison import difference_table, differences, success_chart
 from planning.controllers import CONTROLLERS, LEARNED, PIXEL_MODELS, Kit
 from planning.episode import Record, mark_of, run_episode
 from planning.film import Film, Studio, film_path, is_filmed
 from planning.filmstrip import filmstrip
 from planning.icem import ICEMConfig
 from planning.records import EpisodeLog
-from planning.report import bar_chart, summarise, table
+from planning.report import summarise, table
 from planning.setups import Setup
 from planning.tasks import TASKS, Task
 from worldmodel.memory import keep_freed_memory
@@ -143,8 +143,17 @@ def main(config: ServoConfig) -> None:
     task = config.task
     env = task.make_env(config.scene, config.image_size)
     studio = Studio(env, task.zoom)
-    kit = Kit(env, config.planner, config.hold, config.checkpoints(), config.device, config.deadline)
-    kit.body, kit.surface, kit.reach = task.body, task.surface, task.reach
+    kit = Kit(
+        env,
+        config.planner,
+        config.hold,
+        config.checkpoints(),
+        config.device,
+        config.deadline,
+        body=task.body,
+        surface=task.surface,
+        reach=task.reach,
+    )
     try:
         learned = {name: kit.model(name) for name in config.model if name in LEARNED}
         kit.hold = common_gap(learned) or config.hold
@@ -212,9 +221,8 @@ def run_missing(config: ServoConfig, env: gym.Env, studio: Studio, kit: Kit, log
         for index, repeat, name in progress:
             if setup is None or setup.index != index:
                 setup = config.task.make_setup(env, index, config.seed)
-                kit.mark = mark_of(setup)
             entropy = (EPISODE_ENTROPY, config.seed, index, repeat)
-            kit.rng = np.random.default_rng(np.random.SeedSequence(entropy))
+            kit.begin(mark_of(setup), np.random.default_rng(np.random.SeedSequence(entropy)))
             film = Film(studio, setup, name) if wants_film(config, index, repeat) else None
             record = run_episode(
                 env, setup, name, CONTROLLERS[name](kit), config.steps, repeat, film.watch if film is not None else None
@@ -247,11 +255,8 @@ def report(config: ServoConfig, log: EpisodeLog) -> None:
     document = {**asked, "models": models, "t3vip_less": paired}
     write_json(config.out / "servo.json", document)
     written = ["servo.json", "episodes.jsonl", "success.png"]
-    bar_chart(models, config.out / "success.png", title)
+    success_chart(models, config.out / "success.png", title)
     print(table(models))
-    if len(models) > 1:
-        comparison_chart(models, config.out / "comparison.png", title)
-        written.append("comparison.png")
     if paired:
         print(f"\n{difference_table(paired)}\n")
     rivals = [name for name in config.model if name in PIXEL_MODELS]

@@ -60,9 +60,15 @@ def _rows(models: Mapping[str, Entry]) -> Rows:
     """A row for each model, and for each further way in which it was made to predict."""
     rows: Rows = []
     for name, entry in models.items():
-        rows.append((f"{name}, {entry['prediction']}" if name != entry["prediction"] else name, entry))
+        rows.append((name if _is_copy(entry) else f"{name}, {entry['prediction']}", entry))
         rows += [(f"{name}, {title}", entry[key]) for key, title in VARIANTS if entry.get(key)]
     return rows
+
+
+def _is_copy(entry: Entry) -> bool:
+    """Whether it is the last frame copied, whatever models are called."""
+    prediction: str = entry["prediction"]
+    return prediction.startswith("copy")
 
 
 def _table(rows: Rows, scores: Sequence[Score]) -> list[str]:
@@ -123,7 +129,7 @@ def draw_curves(document: Mapping[str, Any], path: Path) -> None:
     panels = figure.subplots(height, columns, squeeze=False).flatten()
     for panel, score in zip(panels, shown, strict=False):
         for i, (name, entry) in enumerate(models.items()):
-            colour, style = ("black", "--") if name == entry["prediction"] else (f"C{i % 10}", "-")
+            colour, style = ("black", "--") if _is_copy(entry) else (f"C{i % 10}", "-")
             _draw(panel, entry, score, color=colour, linestyle=style, label=name)
             _draw(panel, entry.get("latents_zero"), score, color=colour, linestyle=":", label=f"{name}, latents at 0")
         panel.set_title(f"{score.title} {ARROWS[score.better]}", fontsize=9)

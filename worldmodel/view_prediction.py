@@ -16,7 +16,7 @@ from envs import command as command_line
 from envs.errors import UsageError
 from worldmodel.checkpoint import PRETRAINED, find_model, load_model, shipped_models
 from worldmodel.clips import ClipSource
-from worldmodel.figure import Storyboard, write_film, write_sheet
+from worldmodel.figure import TRUTH, Storyboard, write_film, write_sheet
 from worldmodel.interface import check_fits
 from worldmodel.pictures import predict, storyboard
 from worldmodel.viewer3d import Scene, require_rerun, view_scene, write_scene
@@ -156,7 +156,7 @@ def _only(board: Storyboard, sections: Sequence[Section]) -> Storyboard:
 
 def labels(models: Sequence[str]) -> dict[str, str]:
     """How each model is called in the figure: shipped names in capitals, runs by their folder, if that tells them
-    apart."""
+    apart; none as the truth is."""
     short = {}
     for name in dict.fromkeys(models):
         folder = Path(name)
@@ -165,7 +165,9 @@ def labels(models: Sequence[str]) -> dict[str, str]:
         else:
             folder = folder.resolve()
             short[name] = folder.parent.name if folder.name == "model" else folder.name
-    return short if len(set(short.values())) == len(short) else {name: name for name in short}
+    if len(set(short.values())) < len(short):
+        short = {name: name for name in short}
+    return {name: f"model {label}" if label == TRUTH else label for name, label in short.items()}
 
 
 def _choose(dataset: RGBDDataset, gap: int, options: ViewOptions) -> tuple[int, int]:
@@ -175,7 +177,7 @@ def _choose(dataset: RGBDDataset, gap: int, options: ViewOptions) -> tuple[int, 
     rng = None if options.seed is None else np.random.default_rng(options.seed)
     episode = options.episode
     if episode is None:
-        long_enough = np.flatnonzero(lengths >= span)
+        long_enough = np.flatnonzero(lengths >= span + (options.start or 0))
         episode = 0 if rng is None or not len(long_enough) else int(rng.choice(long_enough))
     if episode >= dataset.episodes:
         raise UsageError(

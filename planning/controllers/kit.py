@@ -38,8 +38,8 @@ class Kit:
         body: what is moved.
         surface: what the designated point lies on; None if it is the end-effector's own.
         reach: draws the end-effector to the thing that the point is on, if given.
-        rng: randomness of the next controller that is made.
-        mark: where the designated point of the next episode truly is, for the oracle; None if it is the end-effector's.
+        rng: randomness of the controllers of this episode.
+        mark: where the designated point of this episode truly is, for the oracle; None if it is the end-effector's.
     """
 
     env: gym.Env
@@ -54,6 +54,10 @@ class Kit:
     rng: np.random.Generator = field(default_factory=np.random.default_rng)
     mark: Mark | None = None
     _models: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+
+    def begin(self, mark: Mark | None, rng: np.random.Generator) -> None:
+        """The controllers made from here on are those of another episode."""
+        self.mark, self.rng = mark, rng
 
     @property
     def camera(self) -> CameraModel:

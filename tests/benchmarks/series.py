@@ -20,6 +20,7 @@ SIZES: dict[str, tuple[Any, ...]] = {
     "precision": ("bfloat16", "float32"),
 }
 """What is varied, one at a time, about the `cpu` preset at the end of its curriculum."""
+PAPERS_NETWORK: Point = {"width": 1.0, "kernel": 5}
 GPU_CHANGES: tuple[Point, ...] = (
     {},
     {"compiled": False},
@@ -71,6 +72,7 @@ def _base(preset: str) -> Point:
         "batch": options.batch,
         "width": options.architecture.width,
         "frames": frames,
+        "kernel": options.architecture.lstm_kernel,
         "precision": str(best_precision(torch.device("cpu"))).removeprefix("torch.")
         if options.precision == "auto"
         else options.precision,
@@ -79,13 +81,12 @@ def _base(preset: str) -> Point:
 
 def _points(preset: str, quick: bool) -> dict[str, Point]:
     """Name -> sizes; no point twice."""
+    changes = [{axis: value} for axis, values in SIZES.items() for value in (values[:1] if quick else values)]
     points: dict[str, Point] = {}
-    for axis, values in SIZES.items():
-        for value in values[:1] if quick else values:
-            point = {**_base(preset), axis: value}
-            if point not in points.values():
-                sizes = "batch {batch}, width {width:g}, {frames} frames, {precision}".format(**point)
-                points[f"step: {sizes}"] = point
+    for change in changes if quick else (*changes, PAPERS_NETWORK):
+        point = {**_base(preset), **change}
+        sizes = "batch {batch}, width {width:g}, {frames} frames, LSTMs {kernel} x {kernel}, {precision}"
+        points[f"step: {sizes.format(**point)}"] = point
     return points
 
 

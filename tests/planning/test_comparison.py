@@ -7,7 +7,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from planning.comparison import comparison_chart, difference_table, differences
+from planning.comparison import difference_table, differences, success_chart
 from planning.film import film_path
 from planning.filmstrip import filmstrip, telling
 from planning.report import summarise, table
@@ -82,10 +82,10 @@ def test_tables_and_chart(fleet, tmp_path):
     assert len({len(line) for line in table(models).splitlines()}) == 1
     lines = difference_table(differences(fleet)).splitlines()
     assert len(lines) == 1 + 2 * 3 and "sv2p" in lines[1] and "+75" in lines[1]
-    comparison_chart(models, tmp_path / "comparison.png", "title")
-    assert iio.imread(tmp_path / "comparison.png").shape[1] > 1000
+    success_chart(models, tmp_path / "success.png", "title")
+    assert iio.imread(tmp_path / "success.png").shape[1] > 1000
     part = {name: summarise(of_model[:2]) for name, of_model in fleet.items()}  # empty bins
-    comparison_chart(part, tmp_path / "comparison.png", "title")
+    success_chart(part, tmp_path / "success.png", "title")
 
 
 def test_the_most_telling_setup_is_a_reached_pixel_and_a_missed_point():

@@ -81,9 +81,9 @@ def test_drawer_setups_are_what_they_promise(table):
 
 def test_the_oracle_pushes_a_point_to_its_goal_as_its_simulator_says(push):
     setup = next(setup for setup in (make_push_setup(push, i) for i in range(20)) if setup.part == "behind")
-    kit = Kit(push, ICEMConfig(horizon=5, population=16, iterations=2, elites=4), rng=np.random.default_rng(0))
-    task = TASKS["planar-push", "object"]
-    kit.body, kit.reach, kit.surface, kit.mark = task.body, task.reach, task.surface, setup.mark
+    task, search = TASKS["planar-push", "object"], ICEMConfig(horizon=5, population=16, iterations=2, elites=4)
+    kit = Kit(push, search, body=task.body, reach=task.reach, surface=task.surface)
+    kit.begin(setup.mark, np.random.default_rng(0))
     try:
         record = run_episode(push, setup, "oracle", CONTROLLERS["oracle"](kit), 60)
         assert record.reached("3d") and record.reached("2d") and record.limits[0] == 0.02 and record.part == "behind"
@@ -129,7 +129,7 @@ def test_command_reports_by_parts(tmp_path, monkeypatch, capsys):
     assert set(entry["success_3d_at"]) == {"0.02", "0.01"}
     assert json.loads((tmp_path / "config.json").read_text())["planner"]["horizon"] == 6
     assert (tmp_path / "videos" / "random-setup00-0.mp4").stat().st_size > 1000
-    assert (tmp_path / "comparison.png").stat().st_size > 1000
+    assert (tmp_path / "success.png").stat().st_size > 1000
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import torch
 from data_collection.dataset import RGBDDataset
 from envs.command import parse, run
 from worldmodel import evaluate as command
-from worldmodel import measurement
+from worldmodel import evaluation_report, measurement
 from worldmodel.checkpoint import save_model
 from worldmodel.evaluate import EvaluationOptions, main
 from worldmodel.inference import inference_network
@@ -211,3 +211,8 @@ def test_mistakes_are_one_line(evaluate, model_folder, make_model, write_dataset
             call()
         error = capsys.readouterr().err
         assert end.value.code == 2 and words in error and error.count("\n") == 1, error
+
+
+def test_a_model_may_be_called_like_its_way_of_predicting():
+    models = {"deterministic": {"prediction": "deterministic"}, "copy": {"prediction": "copy"}}
+    assert [title for title, _ in evaluation_report._rows(models)] == ["deterministic, deterministic", "copy"]

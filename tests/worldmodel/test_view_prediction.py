@@ -190,6 +190,13 @@ def test_start_and_seed_decide_the_clip(tiny_dataset, rival_folder, tmp_path, ca
     assert drawn[0][0] == drawn[1][0] and len({said for said, _ in drawn}) > 1
 
 
+def test_an_episode_that_is_drawn_is_long_enough_for_the_start(tiny_dataset, rival_folder, tmp_path, capsys):
+    line = ["--data", tiny_dataset, "--models", rival_folder, "--out", tmp_path / "a.png", "--predicted", 3]
+    for seed in range(4):  # only one of six episodes has a clip of 13 control steps from step 7
+        run(ViewOptions, main, list(map(str, [*line, "--start", 7, "--seed", seed])))
+        assert f"episode {EPISODE} from step 7" in capsys.readouterr().out
+
+
 def test_model_is_the_same_option_as_models(tiny_dataset, model_folder, tmp_path):
     out = str(tmp_path / "a.png")
     run(
@@ -239,6 +246,7 @@ def test_labels_are_short_and_tell_models_apart(model_folder, tmp_path):
     assert labels(["t3vip", str(model_folder)]) == {"t3vip": "T3VIP", str(model_folder): "space"}
     runs = [str(tmp_path / run / "x" / "model") for run in ("a", "b")]
     assert labels(runs) == {run: run for run in runs}
+    assert labels([str(tmp_path / "truth")]) == {str(tmp_path / "truth"): "model truth"}
 
 
 def test_colours_mean_what_the_legends_say(shown):

@@ -43,10 +43,10 @@ SHARES: dict[str, tuple[str, ...]] = {
 pixel above all, is `other`."""
 
 
-def step(preset: str, batch: int, width: float, frames: int, precision: str, repeats: int) -> dict[str, float]:
+def step(preset: str, repeats: int, **sizes: Any) -> dict[str, float]:
     """A step of training: median seconds, and of an eager step GFLOP, GB moved by convolutions and matrix products
     alone, and GB moved by all operators."""
-    trainer = sized_trainer(preset, batch, width, frames, precision)
+    trainer = sized_trainer(preset, **sizes)
     clips = trainer.next_clips()
     seconds = median_seconds(lambda: trainer.update(clips), repeats)
     with torch.compiler.set_stance("force_eager"):
@@ -62,9 +62,9 @@ def step(preset: str, batch: int, width: float, frames: int, precision: str, rep
     }
 
 
-def shares(preset: str, batch: int, width: float, frames: int, precision: str, repeats: int) -> dict[str, float]:
+def shares(preset: str, repeats: int, **sizes: Any) -> dict[str, float]:
     """Where the time of a step goes: shares of the operators' own CPU time that add up to 1."""
-    trainer = sized_trainer(preset, batch, width, frames, precision)
+    trainer = sized_trainer(preset, **sizes)
     clips = trainer.next_clips()
     trainer.update(clips)
     with profile(activities=[ProfilerActivity.CPU]) as profiled:
@@ -109,11 +109,13 @@ class Traffic(TorchDispatchMode):
         return out
 
 
-def sized_trainer(preset: str, batch: int, width: float, frames: int, precision: str, **more: Any) -> Trainer:
-    """Our trainer late in a run of these sizes."""
+def sized_trainer(
+    preset: str, batch: int, width: float, frames: int, precision: str, kernel: int | None = None, **more: Any
+) -> Trainer:
+    """Our trainer late in a run of these sizes; `kernel` is that of the LSTMs, by default the preset's."""
     options = PRESETS[preset]
     schedule = replace(options.schedule, clip_lengths=((1.0, frames),))
-    architecture = replace(options.architecture, width=width)
+    architecture = replace(options.architecture, width=width, lstm_kernel=kernel or options.architecture.lstm_kernel)
     trainer = make_trainer(
         "ours", preset, batch=batch, schedule=schedule, architecture=architecture, precision=precision, **more
     )
