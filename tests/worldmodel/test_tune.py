@@ -26,9 +26,9 @@ def start(tiny_dataset, tmp_path):
     """Starts the command in a process of its own."""
     begun = []
 
-    def begin(trials=TRIALS):
+    def begin(*further, trials=TRIALS):
         line = [sys.executable, "-m", "worldmodel.tune", "--data", tiny_dataset, "--out", tmp_path / "tuned"]
-        line += [*LINE, "--trials", trials]
+        line += [*LINE, "--trials", trials, *further]
         with (tmp_path / "log.txt").open("ab") as log:
             environment = os.environ | {"TORCHDYNAMO_DISABLE": "1"}
             begun.append(subprocess.Popen(list(map(str, line)), stdout=log, stderr=log, env=environment))
@@ -117,3 +117,26 @@ def test_a_worker_and_then_the_search_are_killed_and_the_same_command_goes_on(st
     assert len({trial.point["rgb"] for trial in (*first, new)}) == TRIALS + 1
     assert saved and {path: path.stat().st_mtime_ns for path in saved} == saved  # none of theirs was trained again
     assert f"of {TRIALS + 1} trials begun" in (out / "report.md").read_text()
+
+
+@pytest.mark.timeout(900)
+def test_a_trial_that_died_too_often_has_failed_and_the_same_command_tries_it_anew(start, tmp_path):
+    out = tmp_path / "tuned"
+
+    def end_of(process):
+        assert process.wait() == 0, (tmp_path / "log.txt").read_text()[-3000:]
+        trials = json.loads((out / "report.json").read_text())["trials"]
+        return [trial["status"] for trial in trials], trials[0]
+
+    process = start("--retries", 0, trials=2)
+    lines = wait_for(process, lambda: [line for line in journal.read(out / journal.JOURNAL) if line["kind"] == "score"])
+    os.kill(lines[0]["pid"], signal.SIGKILL)
+    statuses, failed = end_of(process)
+    assert statuses == ["failed", "finished"]
+    assert failed["step"] < STEPS and failed["reason"] and failed["deaths"] == 0
+    assert "2 of 2 trials begun (random): 1 finished, 1 failed\n" in (out / "report.md").read_text()
+    assert "| 0* | failed |" in (out / "report.md").read_text()
+
+    statuses, finished = end_of(start("--retries", 0, trials=2))
+    assert statuses == ["finished", "finished"] and finished["step"] == STEPS and not finished["reason"]
+    assert finished["scores"][str(STEPS // 3)] == failed["scores"][str(STEPS // 3)]  # it went on at its checkpoint

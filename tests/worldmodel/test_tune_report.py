@@ -12,7 +12,7 @@ from worldmodel.train import parse_options
 from worldmodel.tune_report import ReportOptions, main
 from worldmodel.tuning import journal
 from worldmodel.tuning.correlation import rank_correlations
-from worldmodel.tuning.figures import _Scale
+from worldmodel.tuning.figures import _Scale, correlation_figure
 from worldmodel.tuning.journal import Trial
 from worldmodel.tuning.report import FILES
 from worldmodel.tuning.space import WEIGHTS
@@ -167,6 +167,34 @@ def test_pictures(out):
         with Image.open(out / name) as picture:
             assert np.asarray(picture.convert("L")).std() > 10, name
     assert all((out / name).exists() for name in FILES) and len(document["trials"]) == 8
+
+
+def test_each_cell_of_the_rank_correlation_figure_says_r_p_and_n(out):
+    axes = correlation_figure(report(out)).axes[0]
+    columns, rows = (
+        [int(label.get_text()) for label in labels] for labels in (axes.get_xticklabels(), axes.get_yticklabels())
+    )
+    cells = {(rows[y], columns[x]): text.get_text() for text in axes.texts for x, y in [text.get_position()]}
+    assert cells == {
+        (3, 9): "r = 0.900\np = 0.083\nn = 5",
+        (3, 27): "r = 0.500\np = 0.450\nn = 5",
+        (9, 27): "r = 0.600\np = 0.350\nn = 5",
+    }
+    assert axes.get_title() == "rank correlation (unpruned trials)"
+
+
+def test_a_cell_without_a_correlation_says_n_alone_and_no_p_is_0():
+    pairs = [
+        {"budgets": [3, 9], "r": 1.0, "p": 0.0002, "n": 12},
+        {"budgets": [3, 27], "r": None, "p": None, "n": 2},
+        {"budgets": [9, 27], "r": -0.6, "p": 0.2, "n": 6},
+    ]
+    texts = correlation_figure({"budgets": BUDGETS, "shown": pairs, "shown_of": "all"}).axes[0].texts
+    assert [text.get_text() for text in texts] == [
+        "r = 1.000\np < 0.001\nn = 12",
+        "n = 2",
+        "r = -0.600\np = 0.200\nn = 6",
+    ]
 
 
 def test_a_trial_may_lack_an_axis_or_have_a_0_there(out):

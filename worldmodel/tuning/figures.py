@@ -20,6 +20,11 @@ _MAP = "viridis_r"  # the better, the darker
 
 
 def draw_correlations(document: Document, path: Path) -> None:
+    """Save the paper's figure."""
+    _save(correlation_figure(document), path)
+
+
+def correlation_figure(document: Document) -> Figure:
     """The paper's figure: a cell for every pair of budgets with r, p and the number of configurations."""
     budgets = document["budgets"]
     size = len(budgets)
@@ -44,7 +49,7 @@ def draw_correlations(document: Document, path: Path) -> None:
     axes.set_title(f"rank correlation ({document['shown_of']} trials)", fontsize=9)
     axes.tick_params(labelsize=8)
     figure.colorbar(image, ax=axes, shrink=0.8).ax.tick_params(labelsize=7)
-    _save(figure, path)
+    return figure
 
 
 def draw_trials(document: Document, path: Path) -> None:
