@@ -22,6 +22,8 @@ QUIET = {
     "RAY_DEDUP_LOGS_SKIP_REGEX": ".",  # not a word of Ray's own when a process or a machine dies: we say it
     "RAY_agent_register_timeout_ms": "300000",  # a busy machine needs more than the usual 30 s
     "RAY_worker_niceness": "0",  # as nice as this process, not by 15 nicer than whatever else runs
+    # Where memory runs out the kernel kills a worker, a death like others. Ray's own watch would end all of Ray Tune.
+    "RAY_memory_monitor_refresh_ms": "0",
 }
 
 

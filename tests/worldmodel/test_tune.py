@@ -26,11 +26,11 @@ def start(tiny_dataset, tmp_path):
     """Starts the command in a process of its own."""
     begun = []
 
-    def begin(*further, trials=TRIALS):
+    def begin(*further, trials=TRIALS, **variables):
         line = [sys.executable, "-m", "worldmodel.tune", "--data", tiny_dataset, "--out", tmp_path / "tuned"]
         line += [*LINE, "--trials", trials, *further]
         with (tmp_path / "log.txt").open("ab") as log:
-            environment = os.environ | {"TORCHDYNAMO_DISABLE": "1"}
+            environment = os.environ | {"TORCHDYNAMO_DISABLE": "1"} | variables
             begun.append(subprocess.Popen(list(map(str, line)), stdout=log, stderr=log, env=environment))
         return begun[-1]
 
@@ -140,3 +140,11 @@ def test_a_trial_that_died_too_often_has_failed_and_the_same_command_tries_it_an
     statuses, finished = end_of(start("--retries", 0, trials=2))
     assert statuses == ["finished", "finished"] and finished["step"] == STEPS and not finished["reason"]
     assert finished["scores"][str(STEPS // 3)] == failed["scores"][str(STEPS // 3)]  # it went on at its checkpoint
+
+
+@pytest.mark.timeout(900)
+def test_trials_are_not_killed_by_ray_where_memory_is_low(start, tmp_path):
+    process = start(trials=2, RAY_memory_usage_threshold="0.01")  # of all memory, from where on Ray would kill
+    assert process.wait() == 0, (tmp_path / "log.txt").read_text()[-3000:]
+    trials = journal.trials(tmp_path / "tuned" / journal.JOURNAL)
+    assert [(trial.status, trial.deaths) for trial in trials] == [("finished", 0)] * 2

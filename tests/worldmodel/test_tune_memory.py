@@ -1,4 +1,4 @@
-"""Where the data is that a trial trains on: in memory that Ray shares, not in a copy of its own."""
+"""Memory of a search: trials share the data in Ray's, and it may run out."""
 
 import json
 import os
@@ -8,6 +8,7 @@ from unittest import mock
 
 import pytest
 
+from envs.errors import UsageError
 from worldmodel.clips import ClipSource
 from worldmodel.training_data import open_data
 from worldmodel.tuning.options import TuneOptions
@@ -51,3 +52,12 @@ def test_trials_read_the_same_memory_and_cannot_write_to_it(watched, tiny_datase
     assert one.keys() >= {"rgb", "depth", "action", "segmentation"} and one == other
     for name, column in one.items():
         assert not column["free"] and "plasma" in column["file"], name
+
+
+@pytest.mark.timeout(900)
+def test_a_search_that_a_cluster_has_ended_for_want_of_memory_says_how_to_go_on(tiny_dataset, tmp_path):
+    options = TuneOptions(tiny_dataset, tmp_path / "tuned", "tiny", trials=1)
+    options.out.mkdir()
+    raised = RuntimeError("Caught unexpected exception: 1 worker(s) were killed due to the node running low on memory.")
+    with mock.patch("ray.tune.Tuner.fit", side_effect=raised), pytest.raises(UsageError, match="the same command goes"):
+        search(options, open_data(options.training))

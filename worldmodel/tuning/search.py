@@ -109,7 +109,7 @@ def search(options: TuneOptions, data: Data) -> None:
     """Run the trials that have not ended; Ctrl-C leaves a search that goes on from there.
 
     Raises:
-        UsageError: no such cluster, or it has too little for a trial.
+        UsageError: no such cluster, it has too little for a trial, or memory ran low there.
     """
     for name, value in QUIET.items():
         os.environ.setdefault(name, value)
@@ -118,7 +118,16 @@ def search(options: TuneOptions, data: Data) -> None:
         _check_room(options)
         tuner = _tuner(options, data)
         del data  # Ray holds it now, for all processes
-        tuner.fit()
+        try:
+            tuner.fit()
+        except RuntimeError as error:
+            if "running low on memory" not in str(error):
+                raise
+            raise UsageError(
+                "Ray has killed a trial on a machine whose memory ran low, and ended the search; the same command goes "
+                "on with it, with fewer --workers if it happens again. ray start leaves that to the kernel, and the "
+                "search goes on by itself, where RAY_memory_monitor_refresh_ms=0 is set"
+            ) from error
 
 
 def _tuner(options: TuneOptions, data: Data) -> Any:
