@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch._dynamo.utils import counters
 
 from data_collection.dataset import RGBDDataset
 from data_collection.schema import quantise_depth
 from data_collection.writer import write_shard
 from envs.camera import CameraModel
 from worldmodel.clips import ClipSource
+from worldmodel.compilation import can_compile
 from worldmodel.config import ModelConfig, ModelContext
 from worldmodel.t3vip import T3VIP
 
@@ -116,9 +118,28 @@ def build_model(camera: CameraModel | None = None, seed: int = 0, moving: bool =
 
 @pytest.fixture(autouse=True, scope="package")
 def eager() -> Iterator[None]:
-    """Tests do not wait for the compiler, but for the one that compares with it."""
+    """Tests do not wait for the compiler, but for those that compare with it."""
     with torch.compiler.set_stance("force_eager"):
         yield
+
+
+@pytest.fixture
+def both_ways() -> Callable[..., tuple[Any, Any]]:
+    """Calls a function as it is, then with the functions in it compiled, so many of them; returns both results."""
+    if not can_compile():
+        pytest.skip("no C++ compiler")
+
+    def call(function: Callable[[], Any], functions: int) -> tuple[Any, Any]:
+        torch.compiler.reset()
+        counters.clear()
+        plain = function()
+        assert not counters["stats"]["unique_graphs"]
+        with torch.compiler.set_stance("default"):
+            compiled = function()
+        assert counters["stats"]["unique_graphs"] >= functions
+        return plain, compiled
+
+    return call
 
 
 @pytest.fixture(scope="session")

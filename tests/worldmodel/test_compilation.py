@@ -1,6 +1,9 @@
 """Without a compiler, or with one that fails, everything runs as it is."""
 
+import json
 import logging
+import os
+import subprocess
 import sys
 
 import pytest
@@ -42,6 +45,22 @@ def test_without_a_compiler_it_is_the_plain_function(monkeypatch, caplog):
     assert function.__doc__ == "Doubles." and function(torch.ones(2)).tolist() == [2, 2]
     missing = [record.getMessage().split(":")[0] for record in caplog.records if record.levelno == logging.WARNING]
     assert len(missing) == 3 and missing[::2] == ["no C++ compiler found", "no backend for mps found"]  # each once
+
+
+def test_without_a_compiler_a_run_says_so_once_and_learns_the_same(tiny_dataset, tmp_path):
+    plain = {name: value for name, value in os.environ.items() if name not in ("CC", "CXX")} | {"OMP_NUM_THREADS": "1"}
+    (tmp_path / "nothing").mkdir()
+    said, learned = {}, {}
+    for name, variable in {"missing": {"PATH": str(tmp_path / "nothing")}, "off": {"TORCHDYNAMO_DISABLE": "1"}}.items():
+        line = ["--preset", "tiny", "--device", "cpu", "--steps", "2", "--data", tiny_dataset, "--out", tmp_path / name]
+        command = [sys.executable, "-m", "worldmodel.train", *line]
+        done = subprocess.run(command, env=plain | variable, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        said[name] = [line for line in done.stderr.splitlines() if "torch.compile" in line]
+        lines = map(json.loads, (tmp_path / name / "metrics.jsonl").read_text().splitlines())
+        learned[name] = [line["loss"] for line in lines if line["kind"] == "train"]
+    assert len(said["missing"]) == 1 and said["missing"][0].startswith("no C++ compiler found: ") and not said["off"]
+    assert len(learned["off"]) == 2 and learned["missing"] == learned["off"]
 
 
 def test_what_is_missing_has_a_line_beside_a_progress_bar(monkeypatch, capsys):

@@ -7,7 +7,6 @@ import torch
 
 from envs.errors import UsageError
 from worldmodel import losses
-from worldmodel.compilation import can_compile
 from worldmodel.geometry import pixel_grid
 
 RADIUS = 2
@@ -80,26 +79,6 @@ def test_gradient_of_the_alignment_is_right_and_finite_where_points_coincide():
     same = target.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(losses.knn_alignment(same, target, 1), same)
     assert gradient.isfinite().all()
-
-
-@pytest.mark.skipif(not can_compile(), reason="no C++ compiler")
-def test_compiled_search_is_the_plain_one():
-    query, reference = (cloud.float() for cloud in clouds(3, 6, 8, 1))
-    plain = losses.nearest_in_window(query, reference, 1)
-    everywhere = losses.nearest_of_all(query, reference)
-    with torch.compiler.set_stance("default"):
-        assert torch.equal(losses.nearest_in_window(query, reference, 1), plain)
-        assert torch.equal(losses.nearest_of_all(query, reference), everywhere)
-
-
-@pytest.mark.skipif(not can_compile(), reason="no C++ compiler")
-def test_compiled_alignment_has_the_gradient_of_the_plain_one():
-    moved, target = (cloud.float().requires_grad_() for cloud in clouds(3, 6, 8, 1))
-    (plain,) = torch.autograd.grad(losses.knn_alignment(moved, target.detach(), 2), moved)
-    with torch.compiler.set_stance("default"):
-        (compiled,) = torch.autograd.grad(losses.knn_alignment(moved, target.detach(), 2), moved)
-    assert plain.abs().max() > 1e-4
-    torch.testing.assert_close(compiled, plain, rtol=1e-4, atol=1e-7)
 
 
 @pytest.mark.parametrize(("power", "expected"), [(1, 1.5), (2, 2.5)])

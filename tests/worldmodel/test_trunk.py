@@ -11,16 +11,21 @@ from worldmodel.trunk import Decoder, Encoder, scaled
 HEIGHT, WIDTH = 16, 24
 
 
-def test_gates_are_those_of_an_lstm_cell():
+def test_gates_and_their_gradients_are_those_of_an_lstm_cell():
     torch.manual_seed(0)
     cell = torch.nn.LSTMCell(3, 5)
-    x, hidden, memory = torch.randn(2, 3), torch.randn(2, 5), torch.randn(2, 5)
+    x, hidden, memory = (torch.randn(2, size, requires_grad=True) for size in (3, 5, 5))
     gates = F.linear(x, cell.weight_ih, cell.bias_ih) + F.linear(hidden, cell.weight_hh, cell.bias_hh)
     enter, forget, candidate, leave = gates.chunk(4, dim=1)  # PyTorch's order
-    ours = torch.cat((enter, candidate, forget, leave), dim=1)[..., None, None]
+    ours = torch.cat((enter, candidate, forget, leave), dim=1)[..., None, None], memory[..., None, None]
     expected = cell(x, (hidden, memory))
-    for got, want in zip(lstm_gates(ours, memory[..., None, None]), expected, strict=True):
-        torch.testing.assert_close(got[..., 0, 0], want)
+    inputs, upstream = (x, hidden, memory, *cell.parameters()), [torch.randn(2, 5), torch.randn(2, 5)]
+    got = [out[..., 0, 0] for out in lstm_gates(*ours)]
+    torch.testing.assert_close(got, list(expected))
+    gradients = (torch.autograd.grad(outputs, inputs, upstream) for outputs in (got, expected))
+    torch.testing.assert_close(*gradients)
+    with torch.no_grad():  # another way is taken
+        torch.testing.assert_close([out[..., 0, 0] for out in lstm_gates(*ours)], list(expected))
 
 
 def test_convlstm_reads_its_state_from_the_neighbourhood():
