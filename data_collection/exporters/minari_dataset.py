@@ -69,7 +69,7 @@ def export_minari(
         parse_dataset_id(name)
     except (ValueError, TypeError) as error:
         raise UsageError(f"--name {name} is no name for Minari; give one like tabletop/play-c-v0") from error
-    root = root or get_dataset_path()
+    root = (root or get_dataset_path()).resolve()  # Minari cannot write to a relative folder
     target = root / name
     if target.exists():
         raise UsageError(f"{target} is there already; give another --name, or remove it with: minari delete {name}")

@@ -64,6 +64,16 @@ def test_minari_opens_the_export(folder, tmp_path, monkeypatch):
     assert not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.parametrize("told", [["--out", "root"], []])
+def test_minaris_folder_may_be_relative(folder, tmp_path, monkeypatch, told):
+    minari = pytest.importorskip("minari")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", "root")
+    code, _, err = call("export-dataset", [folder, "--to", "minari", "--name", "calvin/play-d-v0", *told])
+    assert code == 0, err
+    assert minari.load_dataset("calvin/play-d-v0").total_episodes == 3
+
+
 def test_an_interrupted_export_leaves_nothing(folder, tmp_path, monkeypatch):
     pytest.importorskip("minari")
     from data_collection.exporters import flat_file, minari_dataset
