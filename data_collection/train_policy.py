@@ -83,8 +83,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Train, save, try."""
-    if config.out.exists():
-        check_continues(config)
+    check_continues(config)
     env = _make_env(config)
     model = _model(config, env)
     config.out.parent.mkdir(parents=True, exist_ok=True)
@@ -100,24 +99,29 @@ def main(config: Config) -> None:
 
 
 def check_continues(config: Config) -> None:
-    """Check that the policy that is there is one that these options made.
+    """Check that the policy and the options that are there, if any, are those that these options made.
 
     Raises:
-        UsageError: nothing says how it was trained, or it was trained with other options; names the first.
+        UsageError: nothing says how the policy was trained, or it was trained with other options (names the first); or
+            what lies in the options' place is something else.
     """
-    path = config.options_file
-    if not path.is_file():
-        raise UsageError(
-            f"{config.out} has no {path.name} beside it, so it is no run to go on with; choose another --out"
-        )
+    path, options = config.options_file, config.kept_options()
+    if not path.exists():
+        if config.out.exists():
+            raise UsageError(
+                f"{config.out} has no {path.name} beside it, so it is no run to go on with; choose another --out"
+            )
+        return
     try:
         before = dict(json.loads(path.read_text()))
-    except (ValueError, TypeError) as error:
-        raise UsageError(f"{path} does not hold the options of a run ({error}); choose another --out") from error
-    for name, asked in config.kept_options().items():
-        if before.get(name) != asked:
+    except (ValueError, TypeError):
+        before = {}
+    if before.keys() != options.keys():
+        raise UsageError(f"{path} is there and does not hold the options of a policy's run; choose another --out")
+    for name, asked in options.items():
+        if config.out.exists() and before[name] != asked:
             raise UsageError(
-                f"{config.out} was trained with {name} = {before.get(name)!r}, not {asked!r}; "
+                f"{config.out} was trained with {name} = {before[name]!r}, not {asked!r}; "
                 "run with the same options to go on with it, or choose another --out"
             )
 
