@@ -70,6 +70,10 @@ class Config:
             raise UsageError(f"--out is {self.out}; give a file that ends in {SUFFIX}")
         if not self.learning_rate > 0:
             raise UsageError(f"--learning-rate is {self.learning_rate}; give a positive number")
+        for name in ("goal_angle", "reward"):
+            value = getattr(self, name)
+            if not _is_hand(self.env) and value != getattr(Config, name):
+                raise UsageError(f"--{name.replace('_', '-')} is {value}, which is for dexhand only; leave it out")
 
     @property
     def options_file(self) -> Path:
@@ -140,12 +144,15 @@ def save(model: Any, path: Path) -> None:
         model.save(file)
 
 
+def _is_hand(env: str) -> bool:
+    return known_env(env) is KNOWN_ENVS["dexhand"]
+
+
 def _make_env(config: Config) -> gymnasium.Env:
     env_id, env_kwargs = resolve_env(config.env, None)
-    known = known_env(env_id)
-    if known is not None:  # another's may always be without pictures, or not know the word
+    if known_env(env_id) is not None:  # another's may always be without pictures, or not know the word
         env_kwargs = {**env_kwargs, "images": False}
-    if known is KNOWN_ENVS["dexhand"]:
+    if _is_hand(env_id):
         env_kwargs = {**env_kwargs, "goal_angle": config.goal_angle, "reward_type": config.reward, "new_goals": False}
     try:
         env = gymnasium.make(env_id, disable_env_checker=True, **env_kwargs)
@@ -229,11 +236,11 @@ def _trial(config: Config, env: gymnasium.Env, model: Any) -> str:
         reached += bool(info.get("is_success", False))
         dropped += bool(info.get("is_dropped", False))
         last.append(info.get("rotation_error", np.nan))
+    said = f"in {config.trials} episodes: goal reached at the end of {reached}"
+    if not _is_hand(config.env):
+        return said
     start, end = np.degrees(np.median(first)), np.degrees(np.median(last))
-    return (
-        f"in {config.trials} episodes: goal reached at the end of {reached}, dropped in {dropped}; "
-        f"median rotation error {start:.0f} degrees at the start, {end:.0f} at the end"
-    )
+    return f"{said}, dropped in {dropped}; median rotation error {start:.0f} degrees at the start, {end:.0f} at the end"
 
 
 def command() -> None:
