@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -68,8 +69,8 @@ class Config:
                 raise UsageError(f"--{name} is {getattr(self, name)}; give 0 or more")
         if self.out.suffix != SUFFIX:
             raise UsageError(f"--out is {self.out}; give a file that ends in {SUFFIX}")
-        if not self.learning_rate > 0:
-            raise UsageError(f"--learning-rate is {self.learning_rate}; give a positive number")
+        if not 0 < self.learning_rate < math.inf:
+            raise UsageError(f"--learning-rate is {self.learning_rate}; give a positive number such as 1e-3")
         for name in ("goal_angle", "reward"):
             value = getattr(self, name)
             if not _is_hand(self.env) and value != getattr(Config, name):

@@ -327,6 +327,7 @@ def test_bad_policy_files_are_named(trained, tmp_path, env):
         (["--out", "x.zip", "--env", "planar-push"], "has no goals"),
         (["--out", "x"], r"\.zip"),
         (["--out", "x.zip", "--steps", "0"], "--steps is 0"),
+        (["--out", "x.zip", "--learning-rate", "inf"], "--learning-rate is inf"),
     ):
         code, _, err = call("train-policy", arguments)
         assert code == 2
