@@ -31,6 +31,7 @@ def test_episodes_are_as_the_environment_gave_them(collected):
     assert (dataset.episode_lengths == 9).all()
     assert dataset.attrs["action_aggregation"] == list(StandIn.ACTION_AGGREGATION)
     assert dataset.attrs["workspace"] == [[-1, -1, 0], [1, 1, 0.1]]
+    assert dataset.attrs["action_bounds"] == [[-1, -1, -1], [1, 1, 1]]
     episode = dataset.episode(1)
     assert (episode["action"][-1] == 0).all() and episode["reward"][-1] == 0
     env = StandIn()
