@@ -31,6 +31,7 @@ from envs.errors import UsageError
 from envs.files import LOCK_NAME, locked, remove_leftovers
 
 IMAGE_SIZE = 64  # pixels
+MAX_TIMEOUT = 1_000_000  # seconds; the system waits for no more than twice that in one go
 
 
 @dataclass(frozen=True)
@@ -80,8 +81,10 @@ class Config:
                 option = name.replace("_", "-")
                 raise UsageError(f"--{option} is {value}; give a whole number of at least {least}")
         extra_kwargs(self.env, self.env_kwargs)
-        if not self.episode_timeout > 0:
-            raise UsageError(f"--episode-timeout is {self.episode_timeout}; give a positive number of seconds")
+        if not 0 < self.episode_timeout <= MAX_TIMEOUT:
+            raise UsageError(
+                f"--episode-timeout is {self.episode_timeout}; give a positive number of seconds, at most {MAX_TIMEOUT}"
+            )
         if self.policy is not None and self.policy not in POLICIES and not self.policy.endswith(SUFFIX):
             raise UsageError(
                 f"--policy is '{self.policy}'; choose one of {', '.join(POLICIES)}, or give a {SUFFIX} of "

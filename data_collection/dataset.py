@@ -61,7 +61,7 @@ class RGBDDataset:
         present = set.intersection(*(set(shard.columns) for shard in self._shards))
         self.columns: tuple[str, ...] = tuple(n for n in COLUMNS if n in present and (columns is None or n in columns))
         self.attrs: dict[str, Any] = self._shards[0].attrs
-        self.has_ground_truth: bool = set(GROUND_TRUTH) <= present
+        self.has_ground_truth: bool = set(GROUND_TRUTH) <= set(self.columns)
         self.episode_lengths: NDArray[np.int64] = np.concatenate([shard.ep_len for shard in self._shards])
 
     def _check(self, shard: Shard, required: Sequence[str]) -> None:

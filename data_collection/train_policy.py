@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -68,8 +69,12 @@ class Config:
                 raise UsageError(f"--{name} is {getattr(self, name)}; give 0 or more")
         if self.out.suffix != SUFFIX:
             raise UsageError(f"--out is {self.out}; give a file that ends in {SUFFIX}")
-        if not self.learning_rate > 0:
-            raise UsageError(f"--learning-rate is {self.learning_rate}; give a positive number")
+        if not 0 < self.learning_rate < math.inf:
+            raise UsageError(f"--learning-rate is {self.learning_rate}; give a positive number such as 1e-3")
+        for name in ("goal_angle", "reward"):
+            value = getattr(self, name)
+            if not _is_hand(self.env) and value != getattr(Config, name):
+                raise UsageError(f"--{name.replace('_', '-')} is {value}, which is for dexhand only; leave it out")
 
     @property
     def options_file(self) -> Path:
@@ -83,8 +88,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Train, save, try."""
-    if config.out.exists():
-        check_continues(config)
+    check_continues(config)
     env = _make_env(config)
     model = _model(config, env)
     config.out.parent.mkdir(parents=True, exist_ok=True)
@@ -100,24 +104,29 @@ def main(config: Config) -> None:
 
 
 def check_continues(config: Config) -> None:
-    """Check that the policy that is there is one that these options made.
+    """Check that the policy and the options that are there, if any, are those that these options made.
 
     Raises:
-        UsageError: nothing says how it was trained, or it was trained with other options; names the first.
+        UsageError: nothing says how the policy was trained, or it was trained with other options (names the first); or
+            what lies in the options' place is something else.
     """
-    path = config.options_file
-    if not path.is_file():
-        raise UsageError(
-            f"{config.out} has no {path.name} beside it, so it is no run to go on with; choose another --out"
-        )
+    path, options = config.options_file, config.kept_options()
+    if not path.exists():
+        if config.out.exists():
+            raise UsageError(
+                f"{config.out} has no {path.name} beside it, so it is no run to go on with; choose another --out"
+            )
+        return
     try:
         before = dict(json.loads(path.read_text()))
-    except (ValueError, TypeError) as error:
-        raise UsageError(f"{path} does not hold the options of a run ({error}); choose another --out") from error
-    for name, asked in config.kept_options().items():
-        if before.get(name) != asked:
+    except (ValueError, TypeError):
+        before = {}
+    if before.keys() != options.keys():
+        raise UsageError(f"{path} is there and does not hold the options of a policy's run; choose another --out")
+    for name, asked in options.items():
+        if config.out.exists() and before[name] != asked:
             raise UsageError(
-                f"{config.out} was trained with {name} = {before.get(name)!r}, not {asked!r}; "
+                f"{config.out} was trained with {name} = {before[name]!r}, not {asked!r}; "
                 "run with the same options to go on with it, or choose another --out"
             )
 
@@ -136,12 +145,15 @@ def save(model: Any, path: Path) -> None:
         model.save(file)
 
 
+def _is_hand(env: str) -> bool:
+    return known_env(env) is KNOWN_ENVS["dexhand"]
+
+
 def _make_env(config: Config) -> gymnasium.Env:
     env_id, env_kwargs = resolve_env(config.env, None)
-    known = known_env(env_id)
-    if known is not None:  # another's may always be without pictures, or not know the word
+    if known_env(env_id) is not None:  # another's may always be without pictures, or not know the word
         env_kwargs = {**env_kwargs, "images": False}
-    if known is KNOWN_ENVS["dexhand"]:
+    if _is_hand(env_id):
         env_kwargs = {**env_kwargs, "goal_angle": config.goal_angle, "reward_type": config.reward, "new_goals": False}
     try:
         env = gymnasium.make(env_id, disable_env_checker=True, **env_kwargs)
@@ -225,11 +237,11 @@ def _trial(config: Config, env: gymnasium.Env, model: Any) -> str:
         reached += bool(info.get("is_success", False))
         dropped += bool(info.get("is_dropped", False))
         last.append(info.get("rotation_error", np.nan))
+    said = f"in {config.trials} episodes: goal reached at the end of {reached}"
+    if not _is_hand(config.env):
+        return said
     start, end = np.degrees(np.median(first)), np.degrees(np.median(last))
-    return (
-        f"in {config.trials} episodes: goal reached at the end of {reached}, dropped in {dropped}; "
-        f"median rotation error {start:.0f} degrees at the start, {end:.0f} at the end"
-    )
+    return f"{said}, dropped in {dropped}; median rotation error {start:.0f} degrees at the start, {end:.0f} at the end"
 
 
 def command() -> None:

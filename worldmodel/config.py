@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -51,7 +52,7 @@ class ModelConfig:
     """Initial spread of the mask head's weights. Masks that start out alike never come apart."""
 
     def __post_init__(self) -> None:
-        if self.width <= 0:
+        if not 0 < self.width < math.inf:
             raise UsageError(f"width is {self.width}; give a positive multiplier such as 0.5 or 1.0")
         if self.lstm_kernel < 1 or self.lstm_kernel % 2 == 0:
             raise UsageError(f"lstm-kernel is {self.lstm_kernel}; give an odd number such as 3 or 5")
@@ -59,12 +60,11 @@ class ModelConfig:
             raise UsageError(f"kernel-size is {self.kernel_size}; give an odd number such as 5 or 15")
         if self.masks < 2:
             raise UsageError(f"masks is {self.masks}; give at least 2 (a background and one that moves)")
-        if not self.translation_unit > 0:
+        if not 0 < self.translation_unit < math.inf:
             raise UsageError(f"translation-unit is {self.translation_unit}; give a positive number of pixels")
-        if self.first_shift < 0:
-            raise UsageError(f"first-shift is {self.first_shift}; give pixels, 0 or more")
-        if self.splat_sharpness < 0:
-            raise UsageError(f"splat-sharpness is {self.splat_sharpness}; give 0 or more")
+        for name in ("first_shift", "splat_sharpness", "mask_head_std"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise UsageError(f"{name.replace('_', '-')} is {getattr(self, name)}; give a finite number, 0 or more")
 
 
 @dataclass(frozen=True)

@@ -134,7 +134,7 @@ class TrainOptions:
         for name in ("steps", "batch", "validate_every", "validation_clips", "save_every", "log_every", "frame_gap"):
             if getattr(self, name) < 1:
                 raise UsageError(f"{name.replace('_', '-')} is {getattr(self, name)}; give at least 1")
-        if self.minutes is not None and not self.minutes > 0:
+        if self.minutes is not None and not 0 < self.minutes < math.inf:
             raise UsageError(f"minutes is {self.minutes}; give a positive number such as 20, or --steps instead")
         if self.memory_limit is not None and not self.memory_limit >= 0:
             raise UsageError(f"memory-limit is {self.memory_limit}; give GB, or 0 to read everything from the disk")
@@ -143,8 +143,8 @@ class TrainOptions:
         if not self.clip_gradient > 0:
             raise UsageError(f"clip-gradient is {self.clip_gradient}; give a positive number, inf for no limit")
         for name in ("colour_jitter", "seed"):
-            if not getattr(self, name) >= 0:
-                raise UsageError(f"{name.replace('_', '-')} is {getattr(self, name)}; give 0 or more")
+            if not 0 <= getattr(self, name) < math.inf:
+                raise UsageError(f"{name.replace('_', '-')} is {getattr(self, name)}; give a finite number, 0 or more")
         taught = ("rgb", "depth", "knn") if self.model.startswith("t3vip") else ("rgb",)
         if not any(getattr(self.losses, name) for name in taught):
             raise UsageError(

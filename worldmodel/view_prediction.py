@@ -82,8 +82,8 @@ class ViewOptions:
             value = getattr(self, name)
             if value is not None and value < bound:
                 raise UsageError(f"--{name} is {value}; give a whole number of at least {bound}")
-        if not self.speed > 0:
-            raise UsageError(f"--speed is {self.speed}; give a positive number, 1 for real time")
+        if not 0.01 <= self.speed <= 100:
+            raise UsageError(f"--speed is {self.speed}; give a number from 0.01 to 100, 1 for real time")
         if not self.models:
             raise UsageError("--models is empty; name at least one")
         for path in self.out:

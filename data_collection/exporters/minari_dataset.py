@@ -2,7 +2,7 @@
 
 <root>/<name>/data/{main_data.hdf5, metadata.json}; an episode of T actions has
   observations  rgb (T+1, 3, H, W) uint8, depth (T+1, H, W) float32 metres, proprio (T+1, P) float32
-  actions       (T, A) float32          rewards (T,)
+  actions       (T, A) float32          rewards (T,); bounds as the shards tell, or the environment if it is of ours
   terminations, truncations (T,)        in the last step one of them is true: the first after a terminal state
   infos         our other columns: state, and the optional ones that the dataset has, (T+1, ...) each
   metadata      `rgbd`: camera, action_aggregation, action_scale, control_rate, and the rest of our attributes
@@ -22,6 +22,7 @@ import numpy as np
 
 from data_collection.attributes import FROM_CAMERA
 from data_collection.dataset import RGBDDataset
+from data_collection.environments import KNOWN_ENVS, known_env
 from data_collection.schema import COLUMNS
 from envs.errors import UsageError
 from envs.files import written_aside
@@ -69,14 +70,14 @@ def export_minari(
         parse_dataset_id(name)
     except (ValueError, TypeError) as error:
         raise UsageError(f"--name {name} is no name for Minari; give one like tabletop/play-c-v0") from error
-    root = root or get_dataset_path()
+    root = (root or get_dataset_path()).resolve()  # Minari cannot write to a relative folder
     target = root / name
     if target.exists():
         raise UsageError(f"{target} is there already; give another --name, or remove it with: minari delete {name}")
     aside = root / f".{name.replace('/', '-')}.{os.getpid()}.tmp"  # Minari does not look into hidden folders
     aside.mkdir(parents=True)
     try:
-        spaces = observation_space(dataset), _box(dataset.action_dim)
+        spaces = observation_space(dataset), action_space(dataset)
         storage = MinariStorage.new(aside / "data", *spaces, env_spec=_env_spec(dataset))
         storage.update_metadata(_metadata(dataset, name, author, minari.__version__))
         for number in range(dataset.episodes):
@@ -100,6 +101,16 @@ def observation_space(dataset: RGBDDataset) -> gymnasium.spaces.Dict:
         depth=gymnasium.spaces.Box(np.float32(camera.near), np.float32(camera.far), size, np.float32),
         proprio=_box(dataset.episode(0)["proprio"].shape[1]),
     )
+
+
+def action_space(dataset: RGBDDataset) -> gymnasium.spaces.Box:
+    """The space of the actions; without bounds where neither the shards tell them nor their environment is of ours."""
+    bounds, env_id, size = dataset.attrs.get("action_bounds", ()), dataset.attrs["env_id"], dataset.action_dim
+    if np.shape(bounds) == (2, size):
+        return gymnasium.spaces.Box(*np.asarray(bounds, np.float32), dtype=np.float32)
+    if known_env(env_id) and env_id not in KNOWN_ENVS:  # what is imported may be called dexhand, too
+        return gymnasium.spaces.Box(-1, 1, (size,), np.float32)
+    return _box(size)
 
 
 def episode_buffer(dataset: RGBDDataset, number: int) -> dict[str, Any]:

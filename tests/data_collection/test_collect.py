@@ -31,6 +31,7 @@ def test_episodes_are_as_the_environment_gave_them(collected):
     assert (dataset.episode_lengths == 9).all()
     assert dataset.attrs["action_aggregation"] == list(StandIn.ACTION_AGGREGATION)
     assert dataset.attrs["workspace"] == [[-1, -1, 0], [1, 1, 0.1]]
+    assert dataset.attrs["action_bounds"] == [[-1, -1, -1], [1, 1, 1]]
     episode = dataset.episode(1)
     assert (episode["action"][-1] == 0).all() and episode["reward"][-1] == 0
     env = StandIn()
@@ -247,6 +248,8 @@ def test_keyword_arguments_that_environments_get(tmp_path, changed, kwargs):
         ({"env": "no_such_module:x/Y-v0"}, ("no_such_module:x/Y-v0",)),
         ({"env": "CartPole-v1", "episodes": 0}, ("--episodes", "0")),
         ({"workers": 0}, ("--workers", "0")),
+        ({"episode-timeout": "inf"}, ("--episode-timeout is inf", "at most 1000000")),
+        ({"episode-timeout": 3e6}, ("--episode-timeout is 3000000.0", "at most 1000000")),
         ({"image-size": 2}, ("--image-size", "2")),
         ({"env": "standin:standin/Nothing-v0"}, ("standin/Nothing-v0",)),
         ({"env": "planar-push", "env-kwargs": '{"supersample": 1.5}'}, ("supersample is 1.5", "odd number")),

@@ -50,10 +50,12 @@ def test_round_trip(folder, episodes):
             np.testing.assert_array_equal(dataset.load(name)[start:stop], values)
 
 
-def test_ground_truth_is_seen_only_if_all_shards_have_it(tmp_path):
+def test_ground_truth_is_seen_only_if_all_shards_have_it_and_it_will_be_read(tmp_path):
     rng = np.random.default_rng(0)
     write_shard(tmp_path / "shard-00000.h5", [make_episode(rng, 3, ground_truth=True)], ATTRS, [0])
     assert RGBDDataset(tmp_path).has_ground_truth
+    assert RGBDDataset(tmp_path, ["rgb", "segmentation", "body_pose"]).has_ground_truth
+    assert not RGBDDataset(tmp_path, ["rgb", "segmentation"]).has_ground_truth
     write_shard(tmp_path / "shard-00001.h5", [make_episode(rng, 3)], ATTRS, [1])
     assert not RGBDDataset(tmp_path).has_ground_truth
     with pytest.raises(UsageError, match=r"shard-00001.h5 has no column 'segmentation'.*--ground-truth"):

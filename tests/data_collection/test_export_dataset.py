@@ -10,6 +10,7 @@ from commands import assert_one_line_error, call
 from shards import ATTRS, CAMERA, make_episode
 
 from data_collection.dataset import RGBDDataset
+from data_collection.exporters.minari_dataset import action_space
 from data_collection.writer import write_shard
 
 
@@ -62,6 +63,32 @@ def test_minari_opens_the_export(folder, tmp_path, monkeypatch):
     assert_one_line_error(call("export-dataset", arguments), "is there already", "minari delete calvin/play-d-v0")
     assert_one_line_error(call("export-dataset", [*arguments[:4], "play d", *arguments[5:]]), "play d", "no name")
     assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize(
+    ("attrs", "low", "high"),
+    [
+        ({"env_id": "t3vip/TabletopC-v0"}, [-1, -1], [1, 1]),
+        ({"env_id": "envs:t3vip/DexHand-v0"}, [-1, -1], [1, 1]),
+        ({"env_id": "dexhand"}, [-np.inf, -np.inf], [np.inf, np.inf]),  # imported: no commands, but differences
+        ({"env_id": "some/Env-v0", "action_bounds": [[-2, 0], [3, 1]]}, [-2, 0], [3, 1]),
+    ],
+)
+def test_actions_keep_the_bounds_that_are_known(tmp_path, attrs, low, high):
+    episode = make_episode(np.random.default_rng(0), 3)
+    write_shard(tmp_path / "shard-00000.h5", [episode], {**ATTRS, **attrs}, [0])
+    space = action_space(RGBDDataset(tmp_path))
+    assert (space.low.tolist(), space.high.tolist(), space.dtype) == (low, high, np.float32)
+
+
+@pytest.mark.parametrize("told", [["--out", "root"], []])
+def test_minaris_folder_may_be_relative(folder, tmp_path, monkeypatch, told):
+    minari = pytest.importorskip("minari")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", "root")
+    code, _, err = call("export-dataset", [folder, "--to", "minari", "--name", "calvin/play-d-v0", *told])
+    assert code == 0, err
+    assert minari.load_dataset("calvin/play-d-v0").total_episodes == 3
 
 
 def test_an_interrupted_export_leaves_nothing(folder, tmp_path, monkeypatch):

@@ -287,12 +287,24 @@ def test_training_with_other_options_is_refused(trained, tmp_path):
         with pytest.raises(UsageError, match=rf"was trained with {name} = .*, not {value!r}; .* another --out"):
             train_policy.main(dataclasses.replace(config, **{name: value}))
     path.with_suffix(".json").write_text("no options")
-    with pytest.raises(UsageError, match=r"hand\.json does not hold the options"):
+    with pytest.raises(UsageError, match=r"hand\.json is there and does not hold the options"):
         train_policy.main(config)
     path.with_suffix(".json").unlink()
     with pytest.raises(UsageError, match=r"hand\.zip has no hand\.json beside it"):
         train_policy.main(config)
     assert path.read_bytes() == trained.read_bytes()
+
+
+def test_a_file_that_is_no_policys_is_not_overwritten(tmp_path):
+    there = tmp_path / "best.json"
+    config = train_policy.Config(tmp_path / "best.zip", steps=10, trials=0)
+    for content in ('{"learning_rate": 0.01}', "[1, 2]", "no options"):
+        there.write_text(content)
+        with pytest.raises(UsageError, match=r"best\.json .* choose another --out"):
+            train_policy.main(config)
+        assert there.read_text() == content
+    there.write_text(json.dumps(config.kept_options()))
+    train_policy.check_continues(dataclasses.replace(config, goal_angle=90.0))  # killed before it saved a policy
 
 
 def test_bad_policy_files_are_named(trained, tmp_path, env):
@@ -315,6 +327,7 @@ def test_bad_policy_files_are_named(trained, tmp_path, env):
         (["--out", "x.zip", "--env", "planar-push"], "has no goals"),
         (["--out", "x"], r"\.zip"),
         (["--out", "x.zip", "--steps", "0"], "--steps is 0"),
+        (["--out", "x.zip", "--learning-rate", "inf"], "--learning-rate is inf"),
     ):
         code, _, err = call("train-policy", arguments)
         assert code == 2

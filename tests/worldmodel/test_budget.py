@@ -1,6 +1,7 @@
 """`--minutes`: as many steps as fill the time, found once, by a trial that leaves no trace in the run."""
 
 import json
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from envs.errors import UsageError
 from worldmodel import budget, train
 from worldmodel.budget import Cost, measure_cost
 from worldmodel.options import PRESETS, Schedule, TrainOptions
+from worldmodel.study.options import StudyOptions
 
 
 @pytest.mark.parametrize("every", [10, 1000])
@@ -30,6 +32,11 @@ def test_too_little_time_is_refused():
         Cost(step=0.9, validation=4.0, checkpoint=1.0).steps_in(3, options)
     with pytest.raises(UsageError, match="minutes is -1"):
         replace(options, minutes=-1)
+
+
+def test_endless_time_is_refused_for_a_study_too():
+    with pytest.raises(UsageError, match="minutes is inf; give a positive number"):
+        StudyOptions("table", Path("a"), Path("b"), Path("c"), Path("out"), minutes=math.inf)
 
 
 @dataclass

@@ -295,6 +295,7 @@ def test_trials_that_died_too_often_are_tried_again(tune_with, monkeypatch):
         (["--workers", "0"], ["workers is 0"]),
         (["--retries", "-1"], ["retries is -1"]),
         (["--around", "1"], ["around is 1", "above 1"]),
+        (["--gpus-per-trial", "nan"], ["gpus-per-trial is nan"]),
         (["--searcher", "guess"], ["guess"]),
         (["--config", "/nowhere/best.json"], ["/nowhere/best.json", "cannot be read"]),
     ],

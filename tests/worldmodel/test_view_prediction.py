@@ -214,6 +214,7 @@ def test_model_is_the_same_option_as_models(tiny_dataset, model_folder, tmp_path
         (("--predicted", "1000"), "episode 1 has 20 frames"),
         (("--out", "picture.jpg"), "picture.jpg"),
         (("--speed", "0"), "--speed is 0"),
+        (("--speed", "inf"), "--speed is inf"),
         (("--models", "/nowhere"), "/nowhere"),
         (("--data", "/nowhere"), "/nowhere"),
     ],

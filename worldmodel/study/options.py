@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -60,7 +61,7 @@ class StudyOptions:
     """`cpu`, `cuda`, or `auto` for a GPU where there is one."""
 
     def __post_init__(self) -> None:
-        if not self.minutes > 0:
+        if not 0 < self.minutes < math.inf:
             raise UsageError(f"minutes is {self.minutes}; give a positive number such as 20")
         for name in ("steps", "clips"):
             value = getattr(self, name)

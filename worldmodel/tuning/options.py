@@ -74,7 +74,7 @@ class TuneOptions:
     def __post_init__(self) -> None:
         for name, least in (("trials", 1), ("unpruned", 1), ("reduction", 2), ("rungs", 0), ("cpus_per_trial", 1),
                             ("gpus_per_trial", 0), ("retries", 0), ("seed", 0)):  # fmt: skip
-            if getattr(self, name) < least:
+            if not getattr(self, name) >= least:
                 raise UsageError(f"{name.replace('_', '-')} is {getattr(self, name)}; give at least {least}")
         if self.unpruned > self.trials:
             raise UsageError(f"unpruned is {self.unpruned} of {self.trials} trials; give fewer, or more --trials")
