@@ -3,7 +3,7 @@
 import json
 import sys
 from dataclasses import replace
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from worldmodel.trainer import Trainer
 from worldmodel.tuning import journal, searchers
 from worldmodel.tuning.halving import Halving
 from worldmodel.tuning.options import TuneOptions
-from worldmodel.tuning.searchers import make_searcher, ray_space
+from worldmodel.tuning.searchers import budget_of, make_searcher, ray_space
 from worldmodel.tuning.space import LEARNING_RATE, POWER, WEIGHTS, at_point, axes_of, draw, point_of
 
 CONTINUE, STOP = "CONTINUE", "STOP"
@@ -251,20 +251,9 @@ def test_a_search_that_goes_on_remembers_its_rungs(tmp_path):
     assert tell(scheduler, 1, 1, 20.0) == STOP
 
 
-def test_bohb_hears_of_trials_that_diverged(monkeypatch):
-    """As of the worst score at the rung that they did not reach, or at the last."""
-    monkeypatch.setitem(sys.modules, "ConfigSpace", sys.modules.get("ConfigSpace", ModuleType("ConfigSpace")))
-    from worldmodel.tuning.bohb import BOHBSearch, TuneBOHB
-
-    told = []
-    monkeypatch.setattr(TuneBOHB, "on_trial_result", lambda self, trial, found: told.append((trial, found)))
-    monkeypatch.setattr(TuneBOHB, "on_trial_complete", lambda self, trial, found, error: None)
-    searcher = BOHBSearch.__new__(BOHBSearch)
-    searcher._budgets = (1, 3, 9)
-    for step, score, diverged in ((2, 30.0, False), (3, 31.0, False), (0, 0.0, True), (3, 0.0, True), (9, 0.0, True)):
-        searcher.on_trial_complete("a", {"step": step, "score": score, "diverged": diverged})
-    heard = [(found["hyperband_info"]["budget"], found["score"]) for _, found in told]
-    assert heard == [(3, 31.0), (1, 0.0), (9, 0.0), (9, 0.0)]
+def test_a_score_between_rungs_counts_nowhere_and_that_of_a_trial_that_diverged_at_the_next_rung_or_the_last():
+    told = ((2, False), (3, False), (0, True), (3, True), (9, True))
+    assert [budget_of(step, diverged, (1, 3, 9)) for step, diverged in told] == [None, 3, 1, 9, 9]
 
 
 def test_trials_that_died_too_often_are_tried_again(tune_with, monkeypatch):

@@ -7,6 +7,7 @@ from typing import Any
 import ConfigSpace
 from ray.tune.search.bohb import TuneBOHB
 
+from worldmodel.tuning.searchers import budget_of
 from worldmodel.tuning.space import POWER, POWERS, Axis
 
 
@@ -26,18 +27,18 @@ class BOHBSearch(TuneBOHB):
         space.add(ConfigSpace.CategoricalHyperparameter(POWER, list(POWERS)))
         super().__init__(space, metric="score", mode="max", seed=seed)
         self._budgets = budgets
+        self._heard: set[tuple[str, int]] = set()
 
     def set_search_properties(self, metric: str | None, mode: str | None, config: dict[str, Any], **spec: Any) -> bool:
         """It has its space already."""
         return True
 
     def on_trial_result(self, trial_id: str, result: dict[str, Any]) -> None:
-        """Learn from a score at a rung; a trial that diverged has the worst one at the rung that it did not reach."""
-        step = result["step"]
-        if result["diverged"]:
-            step = min((budget for budget in self._budgets if budget > step), default=self._budgets[-1])
-        if step in self._budgets:
-            super().on_trial_result(trial_id, {**result, "hyperband_info": {"budget": step}})
+        """Learn from a score at a rung, once: a trial that goes on tells its scores again."""
+        budget = budget_of(result["step"], result["diverged"], self._budgets)
+        if budget is not None and (trial_id, budget) not in self._heard:
+            self._heard.add((trial_id, budget))
+            super().on_trial_result(trial_id, {**result, "hyperband_info": {"budget": budget}})
 
     def on_trial_complete(self, trial_id: str, result: dict[str, Any] | None = None, error: bool = False) -> None:
         """Learn from the last score, which Ray tells here alone."""

@@ -70,16 +70,25 @@ def ray_space(axes: tuple[Axis, ...]) -> dict[str, Any]:
     return space | {POWER: tune.choice(list(POWERS))}
 
 
+def budget_of(step: int, diverged: bool, budgets: tuple[int, ...]) -> int | None:
+    """The budget at which a score counts, if any; after a divergence the one that was not reached, or the last."""
+    if diverged:
+        return min((budget for budget in budgets if budget > step), default=budgets[-1])
+    return step if step in budgets else None
+
+
 class Numbered(Searcher):
     """Gives every suggestion its `number`; number 0 is a point that is given.
 
-    The inner searcher never hears of that one, which may lie outside of its ranges.
+    The inner searcher never hears of that one, which may lie outside of its ranges. It forgets one that failed, and
+    does not hear how that ends when it is tried again.
     """
 
     def __init__(self, searcher: Searcher, first: Point) -> None:
         super().__init__(**SETTINGS)
         self.searcher, self._first = searcher, first
         self._count, self._first_id = 0, ""
+        self._failed: set[str] = set()
 
     def set_search_properties(self, metric: str | None, mode: str | None, config: dict[str, Any], **spec: Any) -> bool:
         return bool(self.searcher.set_search_properties(metric, mode, config, **spec))
@@ -97,18 +106,25 @@ class Numbered(Searcher):
         return {**plain, "number": self._count - 1}
 
     def on_trial_result(self, trial_id: str, result: dict[str, Any]) -> None:
-        if trial_id != self._first_id:
+        if self._known(trial_id):
             self.searcher.on_trial_result(trial_id, result)
 
     def on_trial_complete(self, trial_id: str, result: dict[str, Any] | None = None, error: bool = False) -> None:
-        if trial_id != self._first_id:
+        if self._known(trial_id):
             self.searcher.on_trial_complete(trial_id, result, error)
+        if error:
+            self._failed.add(trial_id)
 
     def get_state(self) -> dict[str, Any]:
-        return {"count": self._count, "first_id": self._first_id}
+        return {"count": self._count, "first_id": self._first_id, "failed": sorted(self._failed)}
 
     def set_state(self, state: dict[str, Any]) -> None:
         self._count, self._first_id = state["count"], state["first_id"]
+        self._failed = set(state.get("failed", ()))  # searches from before there was such a thing have none
+
+    def _known(self, trial_id: str) -> bool:
+        """To the inner searcher."""
+        return trial_id != self._first_id and trial_id not in self._failed
 
 
 class RandomSearch(Searcher):
