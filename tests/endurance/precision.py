@@ -4,7 +4,7 @@
 
 Both begin with the same weights and go through the same clips and random draws, each by its own gradients. Prints both
 losses of each step and in the end the median and the greatest of their relative differences; the exit code is 1 if that
-is above `--limit`. Where the processor has no instructions for bfloat16 it is emulated, to the same bits and slowly.
+is above `--limit`. Where the processor has no instructions for bfloat16 it is emulated, slowly.
 """
 
 from __future__ import annotations

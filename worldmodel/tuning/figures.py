@@ -17,6 +17,8 @@ from worldmodel.tuning.correlation import written
 Document = dict[str, Any]
 _GREY = "0.75"
 _MAP = "viridis_r"  # the better, the darker
+LEAST_SPREAD_DB = 0.2
+"""Scores that are nearer to each other look alike."""
 
 
 def draw_correlations(document: Document, path: Path) -> None:
@@ -60,7 +62,8 @@ def draw_trials(document: Document, path: Path) -> None:
     budgets, names = document["budgets"], [*document["axes"], "power"]
     shown = [trial for trial in document["trials"] if trial["score"] is not None]
     whole = {t["number"]: t["scores"][str(budgets[-1])] for t in shown if str(budgets[-1]) in t["scores"]}
-    colour = Normalize(min(whole.values(), default=0.0), max(whole.values(), default=1.0))
+    most = max(whole.values(), default=0.0)
+    colour = Normalize(min((most - LEAST_SPREAD_DB, *whole.values())), most)
     scales = [_Scale(np.array([*document["axes"][name], *(_at(t, name) for t in shown)]), True) for name in names[:-1]]
     scales += [_Scale(np.array([1.0, 2.0]), False), _Scale(np.array([t["score"] for t in shown]), False)]
     figure = Figure(figsize=(1.05 * len(scales), 3.6), layout="constrained")
