@@ -21,6 +21,7 @@ from worldmodel.train import parse_options
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")))
 SCRIPTS = dict(re.findall(r'^([\w-]+) = "([\w.]+:\w+)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE))
+MODULES = ("planning.foresight", "planning.tracking_error", "tests.benchmarks", "tests.endurance.precision")
 PACKAGES = ("envs", "data_collection", "worldmodel", "planning", "tests")
 OTHERS = {"source", "pip", "make", "sudo", "export", "rerun", "ray", "cat"}
 OTHERS_OPTIONS = {"--no-deps", "--max-restarts", "--shutdown-timeout"}  # of pip, torchrun
@@ -186,7 +187,7 @@ def options() -> set[str]:
     known: set[str] = set()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COLUMNS", "200")
-        for program in [*SCRIPTS, "planning.foresight", "planning.tracking_error", "tests.benchmarks"]:
+        for program in [*SCRIPTS, *MODULES]:
             told: list[str] = []
             patch.setattr(sys.stdout, "write", told.append)
             with pytest.raises(SystemExit):
