@@ -160,7 +160,6 @@ def describe_env(env: gymnasium.Env, env_id: str, env_kwargs: dict[str, Any]) ->
         UsageError: no OpenGL works, for an environment that draws with it.
     """
     inner: Any = env.unwrapped
-    space: Any = env.action_space
     drawn_here = isinstance(inner, RGBDEnv)  # what draws another's pictures, only that one knows
     attrs = {
         "env_id": env_id,
@@ -169,7 +168,6 @@ def describe_env(env: gymnasium.Env, env_id: str, env_kwargs: dict[str, Any]) ->
         "camera": inner.camera.to_dict(),
         "action_aggregation": list(inner.ACTION_AGGREGATION),
         "action_scale": [float(unit) for unit in inner.ACTION_SCALE],
-        "action_bounds": [space.low.tolist(), space.high.tolist()],
         "body_names": list(getattr(inner, "body_names", [])),
         "hand_body_ids": [int(body) for body in getattr(inner, "hand_body_ids", ())],
         "versions": versions(),
@@ -177,6 +175,9 @@ def describe_env(env: gymnasium.Env, env_id: str, env_kwargs: dict[str, Any]) ->
     }
     if getattr(inner, "workspace", None) is not None:
         attrs["workspace"] = [np.asarray(corner, float).tolist() for corner in inner.workspace]
+    space = env.action_space
+    if isinstance(space, gymnasium.spaces.Box) and space.is_bounded():  # JSON has no infinity
+        attrs["action_bounds"] = [space.low.tolist(), space.high.tolist()]
     return attrs
 
 
