@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, cast
 
 from envs.errors import UsageError
 from worldmodel.config import ModelConfig, ModelContext
@@ -21,6 +21,12 @@ def named_config(name: ModelName, config: ModelConfig) -> tuple[str, ModelConfig
     if name in DETERMINISTIC:
         config = replace(config, latents="none")
     return name.removesuffix("-d"), config
+
+
+def name_of(kind: str, config: ModelConfig) -> ModelName:
+    """The name of a model of this kind and architecture: what `named_config` takes."""
+    name = f"{kind}-d" if config.latents == "none" and f"{kind}-d" in DETERMINISTIC else kind
+    return cast(ModelName, name)
 
 
 def make_model(kind: str, config: ModelConfig, context: ModelContext) -> WorldModel:

@@ -76,6 +76,10 @@ class TrainOptions:
     another run. Options given here win over both."""
     validation: Path | None = None
     """Dataset to validate on; by default the last tenth of the training episodes is held out."""
+    start_from: str | None = None
+    """Start from the weights of this model, not from random ones: a shipped name (`t3vip`, `planar-push/t3vip`), or a
+    run's folder. Model, architecture, frame gap and action column are then its own. It is validated before the first
+    step, too, and stays the best until training makes it better."""
     model: ModelName = "t3vip"
     """t3vip-d is T3VIP without latents; sv2p, sna and cdna are its 2D rivals."""
     architecture: ModelConfig = field(default_factory=ModelConfig)

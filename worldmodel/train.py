@@ -25,6 +25,7 @@ from worldmodel.options import PRESETS, TrainOptions, preset_for
 from worldmodel.ranks import Ranks, join_ranks
 from worldmodel.trainer import Trainer
 from worldmodel.training_data import model_context, open_data, settled
+from worldmodel.warm_start import WarmStart
 
 HOW_NOT_WHAT = ("device", "deterministic", "cuda_graphs", "memory_limit", "save_every", "log_every")
 """Options that a run may go on with others of."""
@@ -49,11 +50,14 @@ def train_with(ranks: Ranks, options: TrainOptions) -> None:
 
     with ExitStack() as stack:
         ranks.decide(lambda: stack.enter_context(_alone_in(options.out)))
-        chosen = ranks.decide(lambda: existing_run(options))
-        if chosen is None:
+        found = ranks.decide(lambda: existing_run(options))
+        if found is None:
             cost = None if options.minutes is None else measure_cost(prepare, options)  # all train, all measure
-            chosen = ranks.decide(lambda: claim(_filling(options, cost)))
-        prepare(chosen).run()
+            options = ranks.decide(lambda: _filling(_precise(options), cost))
+        trainer = prepare(found or options)
+        if found is None:  # only what can be trained takes the folder
+            ranks.decide(lambda: claim(options))
+        trainer.run()
 
 
 def _alone_in(folder: Path) -> AbstractContextManager[int]:
@@ -63,18 +67,25 @@ def _alone_in(folder: Path) -> AbstractContextManager[int]:
 
 
 def make_trainer(options: TrainOptions, train: ClipSource, validation: ValidationSet, ranks: Ranks) -> Trainer:
-    """A trainer with a new model; its weights come from the seed."""
+    """A trainer with a new model; its weights come from the seed, or from the model to start from."""
     kind, architecture = named_config(options.model, options.architecture)
+    start = None if options.start_from is None else WarmStart.load(options.start_from)
+    context = model_context(train, options)
     torch.manual_seed(options.seed)
-    model = make_model(kind, architecture, model_context(train, options))
+    model = make_model(kind, architecture, context if start is None else start.context(context))
     model = model.to(ranks.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    origin = {
+    origin: dict[str, Any] = {
         "options": document_of(options),
         "data": {"train": train.dataset.content_hash, "validation": validation.source.dataset.content_hash},
         "versions": {"torch": torch.__version__},
         "machine": describe(ranks.device),
     }
-    return Trainer(model, options, train, validation, origin, ranks)
+    if start is None:
+        return Trainer(model, options, train, validation, origin, ranks)
+    origin["start"] = start.note(origin["data"])
+    trainer = Trainer(model, options, train, validation, origin, ranks)
+    start.give_weights(trainer.model, trainer.inference)
+    return trainer
 
 
 def _filling(options: TrainOptions, cost: Cost | None) -> TrainOptions:
@@ -145,17 +156,22 @@ def _differences(name: str, before: Any, now: Any) -> list[str]:
 
 def _same(name: str, before: Any, now: Any) -> bool:
     """Whether an option has the same value; a folder may go by several names."""
-    if name in ("data", "validation") and before is not None and now is not None:
+    if name in ("data", "validation", "start_from") and before is not None and now is not None:
         return Path(before).resolve() == Path(now).resolve()
     return bool(before == now)
 
 
 def claim(options: TrainOptions) -> TrainOptions:
-    """Write the options beside the run; returns them, with the precision that this machine made of `auto`."""
-    options = replace(options, precision=find_precision(options.precision, find_device(options.device)))
+    """Write the options beside the run; returns them, with the precision that this machine makes of `auto`."""
+    options = _precise(options)
     options.out.mkdir(parents=True, exist_ok=True)
     write_json(options.out / "config.json", document_of(options))
     return options
+
+
+def _precise(options: TrainOptions) -> TrainOptions:
+    """The options with the precision that this machine makes of `auto`."""
+    return replace(options, precision=find_precision(options.precision, find_device(options.device)))
 
 
 def document_of(options: TrainOptions) -> dict[str, Any]:
@@ -166,8 +182,8 @@ def document_of(options: TrainOptions) -> dict[str, Any]:
 
 
 def _preset(arguments: Sequence[str]) -> TrainOptions:
-    """The options that hold where the command line is silent: those of its preset for its model, changed by its
-    --config."""
+    """The options that hold where the command line is silent: those of its preset for its model, changed by the model
+    that it starts from, and by its --config."""
     path = command_line.given(arguments, "--config")
     values = {} if path is None else read_config(Path(path))
     if command_line.given(arguments, "--steps") is not None:  # they take the file's time's place
@@ -177,7 +193,11 @@ def _preset(arguments: Sequence[str]) -> TrainOptions:
     name = command_line.given(arguments, "--preset") or values.pop("preset", "cpu")
     if not isinstance(name, str) or name not in PRESETS:
         raise UsageError(f"no preset '{name}'; there are {', '.join(PRESETS)}")
-    options = preset_for(name, str(command_line.given(arguments, "--model") or values.get("model", "t3vip")))
+    given = command_line.given(arguments, "--start-from") or values.get("start_from")
+    start = None if given in (None, "None") else WarmStart.load(str(given))
+    usual = "t3vip" if start is None else start.model_name
+    options = preset_for(name, str(command_line.given(arguments, "--model") or values.get("model", usual)))
+    options = options if start is None else start.options(options)
     return options if path is None else changed(options, values | {"preset": name}, path)
 
 

@@ -110,6 +110,8 @@ class Trainer:
                 total=options.steps, initial=self.step, desc="train", unit="step", dynamic_ncols=True, disable=not first
             )
             opened.enter_context(bar)
+            if journal and self.step == 0 and options.start_from is not None:
+                bar.write(f"{options.start_from}: {summary(self.score(journal))}")
             stops = opened.enter_context(stop_signals())
             while self.step < options.steps:
                 self.model.train()

@@ -103,6 +103,8 @@ class TuneOptions:
         options = parse_options(words)
         if options.minutes is not None:
             raise UsageError(f"--config {self.config} has minutes; give --steps, which all trials share")
+        if options.start_from is not None:
+            raise UsageError(f"--config {self.config} has start_from; take it out: trials start from new weights")
         return replace(
             options,
             device="cuda" if self.gpus_per_trial else "cpu",
