@@ -19,6 +19,7 @@ from planning.setups import Setup
 
 THRESHOLDS = (0.1, 0.05, 0.025)  # shares of the initial distance; the first is the paper's
 HITS = 5  # control steps that must be within a threshold
+LAST_STEPS = 20  # by which it is told how far off a point stays once it is there
 Watcher = Callable[[int], None]
 
 
@@ -57,6 +58,11 @@ class Record:
         """Whether the goal counts as reached by the limit that decides."""
         return self.success(self.limits[0], space)
 
+    @property
+    def stay(self) -> float:
+        """Mean distance over the last control steps, metres. It says where the point stays if the episode was whole."""
+        return float(np.mean(self.distances[-LAST_STEPS:]))
+
     def to_dict(self) -> dict[str, Any]:
         """The record as JSON knows it."""
         return asdict(self)
@@ -70,11 +76,12 @@ def run_episode(
     steps: int,
     repeat: int = 0,
     watch: Watcher | None = None,
+    whole: bool = False,
 ) -> Record:
     """Let a controller servo from a setup.
 
-    The episode ends early only when nothing is left to be found out: when the tightest limit has been met often enough,
-    in 3D and in the picture.
+    Unless it is to be whole, the episode ends early when nothing is left to be found out about success: when the
+    tightest limit has been met often enough, in 3D and in the picture.
 
     Args:
         env: where; the simulator is the judge, not shown to the controller.
@@ -84,6 +91,7 @@ def run_episode(
         steps: budget of control steps.
         repeat: number of this attempt at the setup.
         watch: called with the control step at the start and after every step, to film.
+        whole: go on to the last step.
     """
     inner: Any = env.unwrapped
     camera = inner.camera
@@ -105,7 +113,7 @@ def run_episode(
         hits_2d += pixel_distance <= limits_2d
         if watch:
             watch(step + 1)
-        if min(hits_3d.min(), hits_2d.min()) >= HITS:
+        if not whole and min(hits_3d.min(), hits_2d.min()) >= HITS:
             break
     return Record(
         model=name,

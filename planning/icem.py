@@ -33,7 +33,8 @@ class ICEMConfig:
     momentum: float = 0.1
     """share of the old mean and deviation that stays (alpha)"""
     init_std: float = 0.5
-    """deviation at the start of every plan, in halves of the action range (sigma_init)"""
+    """deviation at the start of every plan, in halves of the action range (sigma_init). A wide search finds what a
+    narrow one does not reach; a narrow one finds the small moves that are best near a goal"""
     noise_beta: float = 3.0
     """exponent of the coloured noise (beta); high is smooth"""
     keep_fraction: float = 0.3

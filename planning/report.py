@@ -27,8 +27,13 @@ TITLES = {
 }
 
 
-def summarise(records: Sequence[Record]) -> dict[str, Any]:
-    """One model's entry in `servo.json`; distances in metres, shares in [0, 1], intervals of 95 % (Wilson)."""
+def summarise(records: Sequence[Record], whole: bool = False) -> dict[str, Any]:
+    """One model's entry in `servo.json`; distances in metres, shares in [0, 1], intervals of 95 % (Wilson).
+
+    Args:
+        records: of its episodes.
+        whole: whether they went on to their last step.
+    """
     summary: dict[str, Any] = {"episodes": len(records), "setups": len({record.setup for record in records})}
     limits = records[0].limits
     for space in ("2d", "3d"):
@@ -39,6 +44,8 @@ def summarise(records: Sequence[Record]) -> dict[str, Any]:
             str(limit): float(np.mean([record.success(limit, space) for record in records])) for limit in limits
         }
     summary["final_distance_m_median"] = float(np.median([record.final_distance for record in records]))
+    if whole:
+        summary["stay_distance_m_median"] = float(np.median([record.stay for record in records]))
     summary["least_distance_m_median"] = float(np.median([record.least_distance for record in records]))
     summary["initial_distance_m_median"] = float(np.median([record.initial_distance for record in records]))
     summary["plan_seconds_median"] = float(np.median([record.plan_seconds for record in records]))
@@ -99,7 +106,8 @@ def table(models: dict[str, dict[str, Any]]) -> str:
     tighter, parts = list(some["success_3d_at"])[1:], list(parts_of(some))
     share = "by_axis_share" in some
     at = [f"at-{100 * float(limit):g}%" if share else f"at-{1000 * float(limit):g}mm" for limit in tighter]
-    rows = [["model", "episodes", "3D", "95%", *at, "2D", "95%", "final-m", "s/plan", *parts]]
+    stay = ["stay-m"] if "stay_distance_m_median" in some else []
+    rows = [["model", "episodes", "3D", "95%", *at, "2D", "95%", "final-m", *stay, "s/plan", *parts]]
     for name, entry in models.items():
         rows.append(
             [
@@ -111,6 +119,7 @@ def table(models: dict[str, dict[str, Any]]) -> str:
                 _percent(entry["success_2d"]),
                 _interval(entry["success_2d_interval"]),
                 f"{entry['final_distance_m_median']:.3f}",
+                *(f"{entry['stay_distance_m_median']:.3f}" for _ in stay),
                 f"{entry['plan_seconds_median']:.4f}",
                 *(_percent(parts_of(entry)[part]["success_3d"]) for part in parts),
             ]

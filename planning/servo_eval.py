@@ -63,13 +63,18 @@ class ServoConfig:
     test"""
     steps: int = TASKS["tabletop", "hand"].steps
     """budget of control steps per episode"""
+    whole_episodes: bool = False
+    """go on to the last step, to find out where the point stays. Otherwise an episode ends once the tightest limit is
+    met, and the distance is one of that moment"""
     seed: int = 0
     """of the setups and the planners"""
     image_size: int = 64
     """pixels; what the world model was trained on"""
     hold: int = 3
     """control steps that a planned translation is held for where no world model's frame gap says so"""
-    planner: Annotated[ICEMConfig, tyro.conf.arg(name="planner")] = field(default_factory=ICEMConfig)
+    planner: Annotated[ICEMConfig, tyro.conf.arg(name="planner")] = field(
+        default_factory=lambda: TASKS["tabletop", "hand"].planner
+    )
     deadline: float | None = None
     """seconds after which a plan must be there"""
     video: int = 0
@@ -191,6 +196,7 @@ def settings(config: ServoConfig, hold: int, learned: dict[str, Any]) -> dict[st
             "point": config.point,
             "reach": asdict(config.task.reach) if config.task.reach else None,
         }
+    kept |= {"whole_episodes": True} if config.whole_episodes else {}  # older folders do not say, either
     weights = {name: weights_hash(model) for name, model in learned.items()}
     return {**kept, "hold": hold, "planner": asdict(config.planner), "checkpoints": weights}
 
@@ -224,9 +230,9 @@ def run_missing(config: ServoConfig, env: gym.Env, studio: Studio, kit: Kit, log
             entropy = (EPISODE_ENTROPY, config.seed, index, repeat)
             kit.begin(mark_of(setup), np.random.default_rng(np.random.SeedSequence(entropy)))
             film = Film(studio, setup, name) if wants_film(config, index, repeat) else None
-            record = run_episode(
-                env, setup, name, CONTROLLERS[name](kit), config.steps, repeat, film.watch if film is not None else None
-            )
+            watch = film.watch if film is not None else None
+            controller, whole = CONTROLLERS[name](kit), config.whole_episodes
+            record = run_episode(env, setup, name, controller, config.steps, repeat, watch, whole)
             if film is not None:
                 film.save(film_path(config.out / "videos", record))
             progress.set_postfix_str(f"{name}: {100 * record.final_distance:.1f} cm left")
@@ -248,7 +254,7 @@ def report(config: ServoConfig, log: EpisodeLog) -> None:
     """Write servo.json and the chart; print the table. Only the episodes that this command asks for count."""
     attempts = config.attempts()
     records = {name: [log.records[name, setup, repeat] for setup, repeat in attempts] for name in config.model}
-    models = {name: summarise(of_model) for name, of_model in records.items()}
+    models = {name: summarise(of_model, config.whole_episodes) for name, of_model in records.items()}
     paired = differences(records)
     title = f"{config.task.where.replace('{scene}', config.scene)}, {len(attempts)} episodes each"
     asked = {name: getattr(config, name) for name in ("env", "point", "scene", "seed")}

@@ -62,6 +62,7 @@ class Task:
 TASKS: dict[tuple[str, str], Task] = {
     ("tabletop", "hand"): Task(
         "t3vip/Tabletop{scene}-v0", ("D", "A", "B", "C"), make_setup, "servo on scene {scene}",
+        planner=ICEMConfig(init_std=0.1),
     ),
     ("tabletop", "drawer"): Task(
         "t3vip/Tabletop{scene}-v0", ("D", "A", "B", "C"), make_drawer_setup, "drawer of scene {scene}",

@@ -65,7 +65,7 @@ def test_finished_episodes_are_filmed_when_a_film_is_asked_for(tmp_path, monkeyp
     """Without a simulator: an episode is a number that is drawn."""
     ran = []
 
-    def run_episode(env, setup, name, drawn, steps, repeat, watch):
+    def run_episode(env, setup, name, drawn, steps, repeat, watch, whole):
         ran.append(drawn)
         return record(name, setup.index, repeat=repeat)
 

@@ -74,6 +74,29 @@ def test_proportional_arrives_and_stops_when_nothing_is_left_to_find_out(env):
     assert record.final_distance == pytest.approx(record.distances[-1], abs=1e-5)
 
 
+def test_whole_episodes_say_where_the_point_stays(tmp_path, run):
+    options = ["--model", "proportional", "--episodes", 2, "--steps", 30]
+    assert run(*options, "--out", tmp_path / "short")[0] == 0
+    code, out, _ = run(*options, "--whole-episodes", "--out", tmp_path / "whole")
+    assert code == 0 and "stay-m" in out
+    short, whole = (
+        [json.loads(line) for line in (tmp_path / name / "episodes.jsonl").read_text().splitlines()]
+        for name in ("short", "whole")
+    )
+    for early, late in zip(short, whole, strict=True):
+        assert early["steps"] < late["steps"] == 30
+        assert early["distances"] == late["distances"][: early["steps"]]
+    other, entry = (
+        json.loads((tmp_path / name / "servo.json").read_text())["models"]["proportional"]
+        for name in ("short", "whole")
+    )
+    stays = [np.mean(record["distances"][-20:]) for record in whole]
+    assert entry["stay_distance_m_median"] == pytest.approx(np.median(stays)) and np.median(stays) > 0
+    assert "stay_distance_m_median" not in other
+    code, _, err = run(*options, "--out", tmp_path / "whole")
+    assert code == 2 and "whole_episodes" in err
+
+
 def test_t3vip_arrives_in_the_simulator_with_an_exact_model(env, make_exact_model, monkeypatch):
     monkeypatch.setattr(checkpoint, "load_model", lambda name, device: make_exact_model(env.unwrapped.camera))
     assert episode(env, "t3vip", 1, steps=45).success(0.1, "3d")

@@ -13,11 +13,13 @@ from planning.controllers.base import Goal
 from planning.controllers.t3vip import T3VIPController
 from planning.costs import env_action
 from planning.episode import run_episode
-from planning.icem import ICEM, ICEMConfig
+from planning.icem import ICEM
 from planning.setups import CLEARANCE, make_setup
+from planning.tasks import TASKS
 from worldmodel import load_model
 
 SETUPS = (0, 1, 2)
+STEPS = 24  # twice what the model needs to be there
 NEAR = 0.1  # of the initial distance
 
 
@@ -65,12 +67,12 @@ def model():
 
 
 def planner() -> ICEM:
-    return ICEM(ICEMConfig(), -np.ones(3), np.ones(3), np.random.default_rng(0))
+    return ICEM(TASKS["tabletop", "hand"].planner, -np.ones(3), np.ones(3), np.random.default_rng(0))
 
 
 def left(env, controller, index: int) -> float:
     """Least share of the way that was left at any time of a servo episode."""
-    record = run_episode(env, make_setup(env, index, seed=99), "any", controller, steps=60)
+    record = run_episode(env, make_setup(env, index, seed=99), "any", controller, steps=STEPS)
     return record.least_distance / record.initial_distance
 
 

@@ -121,14 +121,15 @@ def test_a_worker_and_then_the_search_are_killed_and_the_same_command_goes_on(st
 
 @pytest.mark.timeout(900)
 def test_a_trial_that_died_too_often_has_failed_and_the_same_command_tries_it_anew(start, tmp_path):
-    out = tmp_path / "tuned"
+    """Where memory is low, too: Ray, which would kill trials then, lets them alone."""
+    out, scarce = tmp_path / "tuned", {"RAY_memory_usage_threshold": "0.01"}  # of all memory, from where on it would
 
     def end_of(process):
         assert process.wait() == 0, (tmp_path / "log.txt").read_text()[-3000:]
         trials = json.loads((out / "report.json").read_text())["trials"]
         return [trial["status"] for trial in trials], trials[0]
 
-    process = start("--retries", 0, trials=2)
+    process = start("--retries", 0, trials=2, **scarce)
     lines = wait_for(process, lambda: [line for line in journal.read(out / journal.JOURNAL) if line["kind"] == "score"])
     os.kill(lines[0]["pid"], signal.SIGKILL)
     statuses, failed = end_of(process)
@@ -137,14 +138,6 @@ def test_a_trial_that_died_too_often_has_failed_and_the_same_command_tries_it_an
     assert "2 of 2 trials begun (random): 1 finished, 1 failed\n" in (out / "report.md").read_text()
     assert "| 0* | failed |" in (out / "report.md").read_text()
 
-    statuses, finished = end_of(start("--retries", 0, trials=2))
+    statuses, finished = end_of(start("--retries", 0, trials=2, **scarce))
     assert statuses == ["finished", "finished"] and finished["step"] == STEPS and not finished["reason"]
     assert finished["scores"][str(STEPS // 3)] == failed["scores"][str(STEPS // 3)]  # it went on at its checkpoint
-
-
-@pytest.mark.timeout(900)
-def test_trials_are_not_killed_by_ray_where_memory_is_low(start, tmp_path):
-    process = start(trials=2, RAY_memory_usage_threshold="0.01")  # of all memory, from where on Ray would kill
-    assert process.wait() == 0, (tmp_path / "log.txt").read_text()[-3000:]
-    trials = journal.trials(tmp_path / "tuned" / journal.JOURNAL)
-    assert [(trial.status, trial.deaths) for trial in trials] == [("finished", 0)] * 2

@@ -13,7 +13,7 @@ from data_collection.ray_cluster import QUIET
 from tests.ray_nodes import started_nodes
 from worldmodel.tuning import journal
 
-TRIALS, STEPS = 3, 60
+TRIALS, STEPS = 2, 60
 LINE = ["--preset", "tiny", "--trials", TRIALS, "--steps", STEPS, "--unpruned", TRIALS]
 
 
