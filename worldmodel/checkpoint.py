@@ -26,7 +26,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from safetensors import SafetensorError
@@ -179,6 +179,22 @@ def load_origin(name: str | Path) -> dict[str, Any]:
     """
     origin: dict[str, Any] = json.loads((find_model(name) / CONFIG).read_text()).get("origin", {})
     return origin
+
+
+def data_seen(name: str | Path, part: Literal["train", "validation"]) -> list[str]:
+    """Content hashes of the data that a model was trained on, or chosen by its scores on.
+
+    Those of the models that its weights started from are among them.
+
+    Args:
+        name: see `find_model`.
+        part: `train` or `validation`.
+    """
+    hashes, origin = [], load_origin(name)
+    while origin:
+        hashes += [origin["data"][part]] if part in origin.get("data", {}) else []
+        origin = origin.get("start", {})
+    return hashes
 
 
 def content_hashes(name: str | Path) -> dict[str, str]:

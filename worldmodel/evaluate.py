@@ -15,7 +15,7 @@ from envs import command as command_line
 from envs.errors import UsageError
 from envs.files import locked, write_json, written_aside
 from worldmodel import evaluation_report as report
-from worldmodel.checkpoint import content_hashes, load_inference, load_model, load_origin
+from worldmodel.checkpoint import content_hashes, data_seen, load_inference, load_model
 from worldmodel.clips import ClipSource
 from worldmodel.devices import best_precision, find_device
 from worldmodel.evaluation_table import EvaluationTable
@@ -129,10 +129,9 @@ def main(options: EvaluationOptions) -> None:
 def _remarks(name: str, model: WorldModel, dataset: RGBDDataset) -> list[str]:
     """What the reader of the report must know about this model on this data."""
     notes = check_fits(name, model, dataset)
-    seen = load_origin(name).get("data", {})
-    if seen.get("train") == dataset.content_hash:
+    if dataset.content_hash in data_seen(name, "train"):
         notes.append(f"{name} was trained on this data: its scores say nothing about data that it has not seen")
-    elif seen.get("validation") == dataset.content_hash:
+    elif dataset.content_hash in data_seen(name, "validation"):
         notes.append(f"{name} was chosen by its scores on this data, which are therefore a little too good")
     return notes
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from envs.errors import UsageError
-from worldmodel.checkpoint import content_hashes, load_inference, load_model, load_origin
+from worldmodel.checkpoint import content_hashes, data_seen, load_inference, load_model, load_origin
 from worldmodel.config import ModelContext
 from worldmodel.inference import InferenceNetwork
 from worldmodel.models import ModelName, name_of
@@ -92,9 +92,10 @@ class WarmStart:
         """
         origin = load_origin(self.name)
         before = origin.get("data", {})
-        if before.get("train") == data["validation"] and before != data:  # of the same data the same part was held out
+        if data["validation"] in data_seen(self.name, "train") and before != data:  # else the same part was held out
             raise UsageError(f"{self.name} was trained on the validation set; give another --validation")
-        return {"name": self.name, "step": origin.get("step"), "files": content_hashes(self.name)}
+        kept: dict[str, Any] = {key: origin[key] for key in ("step", "data", "start") if key in origin}
+        return {"name": self.name, "files": content_hashes(self.name), **kept}
 
 
 def _nature(model: WorldModel) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import load_file
 
 from envs.errors import UsageError
-from worldmodel.checkpoint import content_hashes, load_model
+from worldmodel.checkpoint import content_hashes, data_seen, load_model, load_origin
 from worldmodel.train import main, parse_options
 from worldmodel.tuning.options import TuneOptions
 
@@ -46,7 +46,11 @@ def test_a_model_that_training_makes_worse_stays_as_it_was(first, other_data, tm
         assert before.keys() == after.keys() and all(torch.equal(before[name], after[name]) for name in before)
     origin = json.loads((run / "model" / "config.json").read_text())["origin"]
     assert origin["step"] == 0
-    assert origin["start"] == {"name": str(first), "step": 2, "files": content_hashes(first)}
+    seen = load_origin(first)["data"]
+    assert origin["start"] == {"name": str(first), "step": 2, "data": seen, "files": content_hashes(first)}
+    assert (
+        data_seen(run, "train") == [origin["data"]["train"], seen["train"]] and len(set(data_seen(run, "train"))) == 2
+    )
     assert sorted(validations(run)) == [0, 2]
     assert np.mean(validations(run)[2]["score"]) < np.mean(validations(run)[0]["score"])
 
@@ -117,8 +121,10 @@ def test_data_of_another_kind_is_refused(first, write_dataset, camera_of, tmp_pa
 
 def test_it_is_not_judged_by_what_it_was_trained_on(tiny_dataset, other_data, tmp_path):
     first = train(tiny_dataset, tmp_path / "first", "--validation", other_data)
-    with pytest.raises(UsageError, match="was trained on the validation set"):
-        train(other_data, tmp_path / "run", "--validation", tiny_dataset, "--start-from", first)
+    second = train(other_data, tmp_path / "second", "--start-from", first)
+    for start in (first, second):
+        with pytest.raises(UsageError, match="was trained on the validation set"):
+            train(other_data, tmp_path / "run", "--validation", tiny_dataset, "--start-from", start)
 
 
 def test_trials_of_a_search_start_from_new_weights(first, tiny_dataset, tmp_path):
