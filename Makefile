@@ -35,7 +35,7 @@ demo: setup
 	@echo "prediction  $(DEMO)/prediction.png, $(DEMO)/prediction.mp4"
 
 test: lint
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder
 
 lint: setup
 	$(BIN)/ruff check .
