@@ -34,7 +34,7 @@ demo: setup
 	@for video in $(DEMO)/videos/*.mp4; do echo "video       $$video"; done
 	@echo "prediction  $(DEMO)/prediction.png, $(DEMO)/prediction.mp4"
 
-test: lint
+test: lint # three processes even on two cores: they wait a quarter of their time, for others that tests start
 	$(BIN)/python -m pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder
 
 lint: setup

@@ -106,8 +106,9 @@ def table(models: dict[str, dict[str, Any]]) -> str:
     tighter, parts = list(some["success_3d_at"])[1:], list(parts_of(some))
     share = "by_axis_share" in some
     at = [f"at-{100 * float(limit):g}%" if share else f"at-{1000 * float(limit):g}mm" for limit in tighter]
-    stay = ["stay-m"] if "stay_distance_m_median" in some else []
-    rows = [["model", "episodes", "3D", "95%", *at, "2D", "95%", "final-m", *stay, "s/plan", *parts]]
+    distances = {"final-m": "final_distance_m_median", "stay-m": "stay_distance_m_median"}
+    distances = {title: key for title, key in distances.items() if key in some}
+    rows = [["model", "episodes", "3D", "95%", *at, "2D", "95%", *distances, "s/plan", *parts]]
     for name, entry in models.items():
         rows.append(
             [
@@ -118,8 +119,7 @@ def table(models: dict[str, dict[str, Any]]) -> str:
                 *(_percent(entry["success_3d_at"][limit]) for limit in tighter),
                 _percent(entry["success_2d"]),
                 _interval(entry["success_2d_interval"]),
-                f"{entry['final_distance_m_median']:.3f}",
-                *(f"{entry['stay_distance_m_median']:.3f}" for _ in stay),
+                *(f"{entry[key]:.3f}" for key in distances.values()),
                 f"{entry['plan_seconds_median']:.4f}",
                 *(_percent(parts_of(entry)[part]["success_3d"]) for part in parts),
             ]

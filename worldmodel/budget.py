@@ -36,7 +36,8 @@ class Cost:
             UsageError: not even one step fits.
         """
         rate = self.step + self.validation / options.validate_every + self.checkpoint / options.save_every
-        steps = int((seconds - self.validation - self.checkpoint) / rate)  # both come once more, at the end
+        validations = 1 if options.start_from is None else 2  # once more at the end, and what a run starts from
+        steps = int((seconds - validations * self.validation - self.checkpoint) / rate)
         if steps < 1:
             raise UsageError(
                 f"minutes is {seconds / 60:g}, and one step, validation and checkpoint take "

@@ -51,12 +51,15 @@ class WarmStart:
     def context(self, context: ModelContext) -> ModelContext:
         """A run's context with its statistics of actions, in the units of the run's data.
 
-        So the same motion is the same number to the network as before, however things move in the new data.
+        So the same motion is the same number to the network as before, however things move in the new data. A model
+        that sees no actions takes any data's.
 
         Raises:
             UsageError: the data has actions of another kind.
         """
         before = self.model.context
+        if not self.model.config.act_cond:
+            return context
         if before.action_aggregation != context.action_aggregation:
             raise UsageError(
                 f"the data's actions add up by {context.action_aggregation} over a frame gap, those of {self.name} by "

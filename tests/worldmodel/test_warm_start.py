@@ -8,6 +8,7 @@ import torch
 from safetensors.torch import load_file
 
 from envs.errors import UsageError
+from worldmodel.budget import Cost
 from worldmodel.checkpoint import content_hashes, data_seen, load_model, load_origin
 from worldmodel.train import main, parse_options
 from worldmodel.tuning.options import TuneOptions
@@ -125,6 +126,21 @@ def test_it_is_not_judged_by_what_it_was_trained_on(tiny_dataset, other_data, tm
     for start in (first, second):
         with pytest.raises(UsageError, match="was trained on the validation set"):
             train(other_data, tmp_path / "run", "--validation", tiny_dataset, "--start-from", start)
+
+
+def test_a_model_that_sees_no_actions_takes_those_of_any_data(tiny_dataset, write_dataset, tmp_path):
+    blind = train(tiny_dataset, tmp_path / "blind", "--architecture.no-act-cond")
+    other = write_dataset(tmp_path / "absolute", seed=4, action_aggregation=["last"] * 7)
+    assert load_model(train(other, tmp_path / "run", "--start-from", blind)).context.action_aggregation[0] == "last"
+
+
+def test_the_first_validation_takes_its_share_of_the_minutes(first, tiny_dataset):
+    new, adapted = (
+        Cost(1.0, 10.0, 0.0).steps_in(1000.0, parse_options(["--data", str(tiny_dataset), "--out", "x", *further]))
+        for further in ([], ["--start-from", str(first)])
+    )
+    rate = 1 + 10 / 400  # a validation every 400 steps
+    assert (new, adapted) == (int(990 / rate), int(980 / rate))
 
 
 def test_trials_of_a_search_start_from_new_weights(first, tiny_dataset, tmp_path):
