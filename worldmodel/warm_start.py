@@ -55,7 +55,7 @@ class WarmStart:
         that sees no actions takes any data's.
 
         Raises:
-            UsageError: the data has actions of another kind.
+            UsageError: the data has actions of another kind, or in no unit.
         """
         before = self.model.context
         if not self.model.config.act_cond:
@@ -64,6 +64,11 @@ class WarmStart:
             raise UsageError(
                 f"the data's actions add up by {context.action_aggregation} over a frame gap, those of {self.name} by "
                 f"{before.action_aggregation}; train without --start-from"
+            )
+        if not all(context.action_scale):
+            raise UsageError(
+                f"the data's action_scale is {context.action_scale}, and what a unit of 0 means cannot be told; give "
+                "the metres or radians of each, or train without --start-from"
             )
         units = [old / new for old, new in zip(before.action_scale, context.action_scale, strict=True)]
         return replace(

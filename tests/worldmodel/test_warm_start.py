@@ -118,6 +118,9 @@ def test_data_of_another_kind_is_refused(first, write_dataset, camera_of, tmp_pa
     absolute = write_dataset(tmp_path / "absolute", seed=4, action_aggregation=["last"] * 7)
     with pytest.raises(UsageError, match="actions add up by"):
         train(absolute, tmp_path / "run", "--start-from", first)
+    unknown = write_dataset(tmp_path / "unknown", seed=5, action_scale=[0.0] + [0.02] * 6)
+    with pytest.raises(UsageError, match="a unit of 0"):
+        train(unknown, tmp_path / "run", "--start-from", first)
 
 
 def test_it_is_not_judged_by_what_it_was_trained_on(tiny_dataset, other_data, tmp_path):
