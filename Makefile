@@ -20,8 +20,9 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "error: no Python 3.10 to 3.12 with venv here; install one (on Debian: apt-get" \
 	  "install python3 python3-venv python3-dev), or say where it is: make PYTHON=/path/to/python3.11" >&2; exit 2; }
 	@echo "installing into $(VENV): takes some minutes the first time"
-	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@test -x $(BIN)/pip || $(PYTHON) -m venv --upgrade-deps $(VENV) # Python's own pip takes longer
+	$(BIN)/python -m pip install -qq --no-compile --constraint constraints.txt --editable '.[dev]'
+	@$(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true # on all cores, which pip cannot do
 	@touch $@
 
 demo: setup
@@ -34,13 +35,13 @@ demo: setup
 	@for video in $(DEMO)/videos/*.mp4; do echo "video       $$video"; done
 	@echo "prediction  $(DEMO)/prediction.png, $(DEMO)/prediction.mp4"
 
-test: lint # three processes even on two cores: they wait a quarter of their time, for others that tests start
-	$(BIN)/python -m pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder
+test: lint # four processes even on two cores: they wait much of their time, for others that tests start
+	$(BIN)/python -m pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder
 
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(BIN)/mypy --num-workers 2
 
 bench: setup
 	$(BIN)/python -m tests.benchmarks --out build/bench.json
