@@ -28,8 +28,8 @@ def conjugate(quat: Array) -> Array:
 def rotate(quat: Array, vector: Array) -> Array:
     """The vectors (..., 3) turned by `quat` (..., 4)."""
     w, axis = quat[..., :1], quat[..., 1:]
-    twice = 2 * np.cross(axis, vector)
-    return vector + w * twice + np.cross(axis, twice)
+    twice = 2 * _cross(axis, vector)
+    return vector + w * twice + _cross(axis, twice)
 
 
 def from_rotvec(rotvec: Array) -> Array:
@@ -65,6 +65,17 @@ def to_euler(quat: Array) -> Array:
     euler[..., 1] = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
     euler[..., 2] = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return euler
+
+
+def _cross(left: Array, right: Array) -> Array:
+    """`np.cross` of (..., 3), to the same bits in a fraction of its time."""
+    x, y, z = (left[..., i] for i in range(3))
+    a, b, c = (right[..., i] for i in range(3))
+    product = np.empty(np.broadcast_shapes(left.shape, right.shape))
+    product[..., 0] = y * c - z * b
+    product[..., 1] = z * a - x * c
+    product[..., 2] = x * b - y * a
+    return product
 
 
 def _norm(vector: Array) -> Array:

@@ -51,13 +51,14 @@ class BatchSimulator(BatchPhysics[TabletopEnv]):
         actions = clip_sequences(actions, 7)
         physics, warmstart = self._unpack(states, len(actions))
         tcps, fixtures = np.empty((*actions.shape[:2], 3)), np.empty((*actions.shape[:2], len(FIXTURES)))
+        tcp = self._tcp(physics)
         for step in range(actions.shape[1]):
-            tcp = self._tcp(physics)
             controls = self._aim(physics, tcp, actions[:, step])
             substeps = self._substep(physics, warmstart, controls[:, None])
             physics = substeps[:, -1].copy()
             warmstart = (substeps[:, -1, self._qvel] - substeps[:, -2, self._qvel]) / TIMESTEP
-            tcps[:, step], fixtures[:, step] = self._tcp(physics).position, physics[:, self._fixtures]
+            tcp = self._tcp(physics)
+            tcps[:, step], fixtures[:, step] = tcp.position, physics[:, self._fixtures]
         return Paths(tcps, fixtures)
 
     def rollout_tcp(self, states: ArrayLike, actions: ArrayLike) -> NDArray[np.float64]:
