@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 AGGREGATIONS = ("sum", "rotate", "last")
 
@@ -52,9 +52,10 @@ def aggregate_actions(
 def _compose(euler: NDArray[Any]) -> NDArray[np.float64]:
     """(..., g, 3) increments in radians about world axes -> (..., 3) the whole turn."""
     steps = euler.reshape(-1, *euler.shape[-2:])
-    turn = Rotation.from_euler("xyz", steps[:, 0])
+    from_euler = scipy.spatial.transform.Rotation.from_euler
+    turn = from_euler("xyz", steps[:, 0])
     for step in range(1, steps.shape[1]):
-        turn = Rotation.from_euler("xyz", steps[:, step]) * turn
+        turn = from_euler("xyz", steps[:, step]) * turn
     return turn.as_euler("xyz").reshape(*euler.shape[:-2], 3)
 
 

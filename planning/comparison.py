@@ -9,16 +9,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from envs.files import written_aside
 from planning.episode import Record
 from planning.report import AXIS_BINS, TITLES, aligned, in_part, parting, parts_of
 from planning.statistics import Pairs, sign_flip_p
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 REFERENCE = "t3vip"
 """Whom the others are compared with."""
@@ -103,6 +104,8 @@ def success_chart(models: Mapping[str, Mapping[str, Any]], path: Path, title: st
         path: of the picture.
         title: of the first panel.
     """
+    from matplotlib.figure import Figure  # half a second: only where a figure is drawn
+
     figure = Figure(figsize=(11, 3.9), layout="constrained")
     overall, *beside = figure.subplots(1, 3, sharey=True, width_ratios=(1.15, 1, 1))
     some = next(iter(models.values()))

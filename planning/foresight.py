@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
-from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from envs import command
@@ -99,7 +99,7 @@ class Comparison:
         self.true.append(true)
         self.foreseen.append(foreseen)
         if min(cost.std() for cost in costs) > LEAST_SPREAD:
-            self.rank_correlations.append(float(spearmanr(*costs).statistic))
+            self.rank_correlations.append(float(scipy.stats.spearmanr(*costs).statistic))
 
     def table(self) -> dict[str, Any]:
         """Means over plans, by how far they truly take the point."""

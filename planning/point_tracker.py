@@ -15,8 +15,8 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from envs.camera import CameraModel
 
@@ -113,7 +113,7 @@ class PointTracker:
         starts = np.concatenate([expected[None], self._motion + tries.motions])
         start = starts[np.argmin(soft(self._disagreement(starts, seen, expected)).sum(axis=1))]
         room = tries.spacing  # to the neighbours of a start
-        found = least_squares(
+        found = scipy.optimize.least_squares(
             disagreement, start, bounds=(start - room, start + room), loss="soft_l1", x_scale=SURPRISE, max_nfev=20,
             xtol=1e-4, ftol=1e-4,
         )  # fmt: skip

@@ -11,9 +11,9 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+import scipy  # its parts load when they are used
 import torch
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 from torch import Tensor
 
 from data_collection.actions import aggregate_actions
@@ -125,7 +125,7 @@ def actions_followed(actions: NDArray[Any], slices: NDArray[np.int64], control_r
     """
     share = 1 - np.exp(-1 / (control_rate * FOLLOWING_SECONDS))
     changes = action_changes(actions, slices)
-    followed = [lfilter([share], [1, share - 1], changes[start:end], axis=0) for start, end in slices]
+    followed = [scipy.signal.lfilter([share], [1, share - 1], changes[start:end], axis=0) for start, end in slices]
     return np.concatenate(followed).astype(actions.dtype)
 
 

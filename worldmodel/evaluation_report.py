@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-
 from envs.files import written_aside
 from worldmodel.scores import PICTURE_SCORES, SCORES, Score
 
@@ -121,6 +119,8 @@ def line(name: str, entry: Entry) -> str:
 def draw_curves(document: Mapping[str, Any], path: Path) -> None:
     """Scores over the predicted frames, one panel a score, as a PNG: models solid, with latents at 0 dotted where the
     best of many is drawn too, copying dashed."""
+    from matplotlib.figure import Figure  # half a second: only where a figure is drawn
+
     models = document["models"]
     shown = [s for s in DRAWN if any(_drawable(entry["curves"].get(s.name)) for entry in models.values())]
     columns = min(3, max(len(shown), 1))

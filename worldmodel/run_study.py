@@ -7,7 +7,7 @@ import json
 from envs import command as command_line
 from envs.errors import UsageError
 from envs.files import locked, write_json, written_aside
-from worldmodel.study import figures, report
+from worldmodel.study import report
 from worldmodel.study.options import StudyOptions
 from worldmodel.study.results import collect
 from worldmodel.study.scoring import check_lengths, score, scores_of
@@ -57,6 +57,8 @@ def _write(options: StudyOptions) -> None:
     with written_aside(options.out / "study.md") as aside:
         aside.write_text(report.markdown(document))
     if document["models"]:
+        from worldmodel.study import figures  # half a second: only where a figure is drawn
+
         figures.draw_curves(document, options.out / "curves.png")
         figures.draw_bars(document, options.out / "bars.png")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-import scipy.optimize
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
 
 from envs import rotations

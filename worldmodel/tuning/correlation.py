@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import rankdata, spearmanr
+import scipy  # its parts load when they are used
 
 from worldmodel.scores import number
 from worldmodel.tuning.journal import Trial
@@ -50,9 +50,9 @@ def _spearman(first: Sequence[float], second: Sequence[float]) -> tuple[float, f
     """r and p; NaN where either does not vary."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # constant scores: the answer is NaN
-        r, p = spearmanr(first, second)
+        r, p = scipy.stats.spearmanr(first, second)
     if math.isfinite(r) and len(first) <= MOST_ENUMERATED:
-        p = _exact_p(rankdata(first), rankdata(second))
+        p = _exact_p(scipy.stats.rankdata(first), scipy.stats.rankdata(second))
     return r, p
 
 

@@ -10,7 +10,6 @@ from envs.errors import UsageError
 from envs.files import write_json, written_aside
 from worldmodel.tuning import journal
 from worldmodel.tuning.correlation import FEWEST, rank_correlations, written
-from worldmodel.tuning.figures import draw_correlations, draw_trials
 from worldmodel.tuning.journal import PARTS, Trial
 from worldmodel.tuning.search import SETTINGS
 from worldmodel.tuning.space import as_options
@@ -44,10 +43,12 @@ def write_report(out: Path) -> Document:
     write_json(out / "report.json", document)
     with written_aside(out / "report.md") as aside:
         aside.write_text(markdown(document))
+    from worldmodel.tuning import figures  # half a second: only where a figure is drawn
+
     if any(trial["score"] is not None for trial in document["trials"]):
-        draw_trials(document, out / "trials.png")
+        figures.draw_trials(document, out / "trials.png")
     if any(pair["r"] is not None for pair in document["shown"]):
-        draw_correlations(document, out / "rank-correlation.png")
+        figures.draw_correlations(document, out / "rank-correlation.png")
     if document["best"] is not None:
         best = document["trials"][document["best"]]
         options = as_options(best["point"])
