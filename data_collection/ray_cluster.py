@@ -9,6 +9,8 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
+from typing import Any
 
 from envs.errors import UsageError
 
@@ -47,7 +49,17 @@ def connect(address: str | None, cpus: int | None) -> Iterator[None]:
         _check(address)
     import ray  # takes seconds: only for those who use it
 
-    on_sigterm = signal.getsignal(signal.SIGTERM)
+    handler = signal.getsignal(signal.SIGTERM)
+    codes: list[Any] = []
+
+    def on_sigterm(number: int, frame: FrameType | None) -> None:
+        assert callable(handler)
+        try:
+            handler(number, frame)
+        except SystemExit as stop:
+            codes.append(stop.code)
+            raise
+
     for attempt in range(1, TRIES + 1):
         try:
             if address is None:
@@ -67,11 +79,18 @@ def connect(address: str | None, cpus: int | None) -> Iterator[None]:
             if address is not None and os.environ.get("RAY_AUTH_MODE") is None:
                 remedy += "; if it wants a token, which Ray sends nowhere unasked, set RAY_AUTH_MODE=token"
             raise UsageError(f"{where} ({reason}); {remedy}") from error
-    if callable(on_sigterm) and threading.current_thread() is threading.main_thread():
+    handles = callable(handler) and threading.current_thread() is threading.main_thread()
+    if handles:
         signal.signal(signal.SIGTERM, on_sigterm)  # a cluster of our own has put its handler in that place
     try:
         yield
+    except SystemExit:
+        if codes:  # where the signal comes while Ray waits, Ray makes its exit code a 1
+            raise SystemExit(codes[-1]) from None
+        raise
     finally:
+        if handles:
+            signal.signal(signal.SIGTERM, handler)
         ray.shutdown()
 
 

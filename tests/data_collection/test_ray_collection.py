@@ -2,10 +2,13 @@
 
 import os
 import signal
+import threading
+import time
 from pathlib import Path
 from unittest import mock
 
 import pytest
+import ray
 from commands import HERE, assert_one_line_error, call, finish, options, start
 from standin import reset_seed
 
@@ -15,6 +18,7 @@ from data_collection.ray_cluster import QUIET, connect
 from data_collection.ray_workers import Collector, RayPool
 from data_collection.repair import find_damage
 from data_collection.workers import Collected, WorkerLost, collect_episodes
+from envs.command import end_on_sigterm
 from envs.files import locked
 from tests.ray_nodes import started_nodes
 
@@ -108,6 +112,20 @@ def test_a_cluster_of_its_own_ends_with_the_command(tmp_path):
     assert find_damage(tmp_path) == [] and not list(tmp_path.glob("*.tmp"))
     with locked(tmp_path):
         pass
+
+
+def test_a_signal_keeps_its_exit_code_where_it_comes_while_ray_waits(cluster):
+    before = signal.getsignal(signal.SIGTERM)
+    end_on_sigterm("that was all")
+    ended = signal.getsignal(signal.SIGTERM)
+    try:
+        with pytest.raises(SystemExit) as stop, connect(cluster.address, None):
+            never = ray.remote(lambda: time.sleep(600)).remote()
+            threading.Timer(1, os.kill, (os.getpid(), signal.SIGTERM)).start()
+            ray.wait([never], timeout=60)
+        assert stop.value.code == 143 and signal.getsignal(signal.SIGTERM) is ended
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_what_goes_wrong_in_an_actor_is_said(tmp_path, monkeypatch):
