@@ -91,6 +91,7 @@ def main(config: Config) -> None:
     check_continues(config)
     env = _make_env(config)
     model = _model(config, env)
+    model.set_logger(_silent())
     config.out.parent.mkdir(parents=True, exist_ok=True)
     write_json(config.options_file, config.kept_options())
     missing = config.steps - model.num_timesteps
@@ -207,6 +208,13 @@ def _model(config: Config, env: gymnasium.Env) -> Any:
         device="auto",
         **explore,
     )
+
+
+def _silent() -> Any:
+    """A logger for nobody: the usual one would write nothing either, but leaves an empty folder in /tmp each time."""
+    from stable_baselines3.common.logger import Logger
+
+    return Logger(None, [])
 
 
 def _callback(config: Config, update: Callable[[int], Any]) -> Any:
