@@ -11,6 +11,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 DEMO := build/demo
+PACKAGES := envs data_collection worldmodel planning
 
 .PHONY: setup demo test lint bench clean
 
@@ -22,7 +23,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@echo "installing into $(VENV): takes some minutes the first time"
 	@test -x $(BIN)/pip || $(PYTHON) -m venv --upgrade-deps $(VENV) # Python's own pip takes longer
 	$(BIN)/python -m pip install -qq --no-compile --constraint constraints.txt --editable '.[dev]'
-	@$(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true # on all cores, which pip cannot do
+	@$(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib $(PACKAGES) || true # on all cores, which pip cannot do
 	@touch $@
 
 demo: setup

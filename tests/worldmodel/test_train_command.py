@@ -21,8 +21,8 @@ from worldmodel.checkpoint import load_model
 from worldmodel.options import PRESETS, TrainOptions
 from worldmodel.train import _preset, main
 
-STEPS, SAVE_EVERY = 30, 5
-LONG_RUN = ["--steps", STEPS, "--save-every", SAVE_EVERY, "--validate-every", 15, "--batch", 2]
+STEPS, SAVE_EVERY = 20, 5
+LONG_RUN = ["--steps", STEPS, "--save-every", SAVE_EVERY, "--validate-every", 10, "--batch", 2]
 
 
 @pytest.fixture
