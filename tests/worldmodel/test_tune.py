@@ -108,32 +108,36 @@ def test_a_worker_and_then_the_search_are_killed_and_the_same_command_goes_on(st
     line = ["--data", tiny_dataset, "--out", out, *LINE, "--trials", TRIALS]
     run(TuneOptions, tune.main, list(map(str, line)))  # there is nothing left to do, and no Ray to be started
     assert results.read_bytes() == before and not ray.is_initialized()
-    assert len({trial.point["rgb"] for trial in trials}) == TRIALS
+
+    saved = {path: path.stat().st_mtime_ns for path in out.glob("trials/*/checkpoints/*/*.safetensors")}
+    process = start(trials=TRIALS + 1)
+    assert process.wait() == 0, (tmp_path / "log.txt").read_text()[-3000:]
+    *first, new = journal.trials(results)
+    assert first == trials and new.number == TRIALS and new.status in ("finished", "stopped")
+    assert len({trial.point["rgb"] for trial in (*first, new)}) == TRIALS + 1
+    assert saved and {path: path.stat().st_mtime_ns for path in saved} == saved  # none of theirs was trained again
+    assert f"of {TRIALS + 1} trials begun" in (out / "report.md").read_text()
 
 
 @pytest.mark.timeout(900)
-def test_a_trial_that_died_too_often_has_failed_and_a_search_for_more_trials_tries_it_anew(start, tmp_path):
+def test_a_trial_that_died_too_often_has_failed_and_the_same_command_tries_it_anew(start, tmp_path):
     """Where memory is low, too: Ray, which would kill trials then, lets them alone."""
     out, scarce = tmp_path / "tuned", {"RAY_memory_usage_threshold": "0.01"}  # of all memory, from where on it would
 
     def end_of(process):
         assert process.wait() == 0, (tmp_path / "log.txt").read_text()[-3000:]
         trials = json.loads((out / "report.json").read_text())["trials"]
-        return [trial["status"] for trial in trials], trials
+        return [trial["status"] for trial in trials], trials[0]
 
     process = start("--retries", 0, trials=2, **scarce)
     lines = wait_for(process, lambda: [line for line in journal.read(out / journal.JOURNAL) if line["kind"] == "score"])
     os.kill(lines[0]["pid"], signal.SIGKILL)
-    statuses, (failed, other) = end_of(process)
+    statuses, failed = end_of(process)
     assert statuses == ["failed", "finished"]
     assert failed["step"] < STEPS and failed["reason"] and failed["deaths"] == 0
     assert "2 of 2 trials begun (random): 1 finished, 1 failed\n" in (out / "report.md").read_text()
     assert "| 0* | failed |" in (out / "report.md").read_text()
 
-    saved = {path: path.stat().st_mtime_ns for path in out.glob("trials/*1/checkpoints/*/*.safetensors")}
-    statuses, (finished, kept, _) = end_of(start("--retries", 0, trials=3, **scarce))
-    assert statuses[:2] == ["finished", "finished"] and statuses[2] in ("finished", "stopped")
-    assert "of 3 trials begun" in (out / "report.md").read_text()
-    assert kept == other and saved and {path: path.stat().st_mtime_ns for path in saved} == saved  # not trained again
-    assert finished["step"] == STEPS and not finished["reason"]
+    statuses, finished = end_of(start("--retries", 0, trials=2, **scarce))
+    assert statuses == ["finished", "finished"] and finished["step"] == STEPS and not finished["reason"]
     assert finished["scores"][str(STEPS // 3)] == failed["scores"][str(STEPS // 3)]  # it went on at its checkpoint
